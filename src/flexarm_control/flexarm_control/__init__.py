@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws, observers and trajectories for arms with flexible links; ROS only in `nodes`."""
+"""Control laws, observers and trajectories for arms with flexible links; only `nodes` uses ROS."""

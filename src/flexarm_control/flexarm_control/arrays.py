@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small arrays on the control path, where numpy's convenience costs more than the arithmetic."""
+"""Fast operations on small arrays on the control path, where numpy's overhead costs more than the arithmetic."""
 
 import numpy as np
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What slow laws, fast laws, manifolds, feed-forwards and observers have in common, and how one is made by name."""
+"""Base classes of slow laws, fast laws, manifolds, feed-forwards and observers, and their construction by name."""
 
 from types import SimpleNamespace
 
@@ -12,8 +12,8 @@ from flexarm_dynamics.parameters import check_all, sizes
 class Component:
     """A part of the control that is found by name, designed once, and called once per sample.
 
-    All design work is done in the constructor. A session begins with `reset`; after a redesign the new component
-    goes on by `resume`. A component without states of its own has nothing to do in either.
+    The constructor does all design work. `reset` begins a session. After a redesign, `resume` lets the new component
+    go on from the old one's states. A component without states of its own has nothing to do in either.
 
     Parameters
     ----------
@@ -35,19 +35,19 @@ class Component:
         return ()
 
     def reset(self):
-        """A new session begins: forget the states that the last one left."""
+        """Begin a new session: forget the states of the last one."""
 
     def resume(self, other):
-        """Go on from the states of another component, which may be of another kind: a redesign does not start over."""
+        """Go on from the states of another component, perhaps of another kind: a redesign does not start over."""
 
 
 class Law(Component):
-    """A component whose states, if it has any, advance apart from its output."""
+    """A component whose states, if it has any, advance separately from its output."""
 
     def advance(self, dt):
         """Advance the law's own states by the time since the last sample.
 
-        Called before `torque`, once for every new sample but the first; a repeated sample advances nothing.
+        It is called before `torque`, once for every new sample except the first. A repeated sample advances nothing.
 
         Parameters
         ----------
@@ -71,8 +71,8 @@ def at_rest(q):
 def make(group, name, model, values, prefix, *known):
     """Find a component by its `name` in an entry-point `group`, check its parameters and design it.
 
-    `values` are those of this component alone, without `prefix`, which errors put before their names. `known` is
-    what it is designed for besides the model: the slow law, for a manifold.
+    `values` are the parameters of this component alone, by names without the `prefix` that errors put before them.
+    `known` is what the component is designed for besides the model, such as the slow law for a manifold.
 
     Raises
     ------

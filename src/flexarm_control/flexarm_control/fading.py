@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Jumps that fade: a signal that is exchanged for another one goes over to it without a step.
+r"""Fading of jumps: when one signal replaces another, the output changes to the new one without a step.
 
-What is missing to the old signal at the exchange is added to the new one, and fades:
+The old signal minus the new one, at the exchange, is added to the new signal and fades:
 
 .. math::
     s(t) + \sum_i J_i\,\phi(t - t_i), \qquad
     \phi(t) = \bigl(1 + \lambda t + \tfrac{1}{2}\lambda^2t^2\bigr)\,e^{-\lambda t}.
 
-J_i is the old signal at t_i less the new one. The first two derivatives of phi are zero at the exchange, and a
-hundredth is left after 8.4 / lambda: with lambda = `FADING` omega_1, after a ninth of the lowest bending mode's period.
+J_i is the old signal minus the new one at t_i. The first two derivatives of phi are zero at the exchange. A hundredth
+is left after 8.4 / lambda; with lambda = `FADING` omega_1 this is a ninth of the lowest bending mode's period.
 """
 
 import numpy as np
 
 from . import kernels
 
-#: lambda over the lowest bending frequency with locked joints.
+#: Ratio of lambda to the lowest bending frequency with locked joints.
 FADING = 12.0
-#: A jump is gone when this is left of it, in any coordinate and torque.
+#: A jump counts as gone when less than this is left of it in every coordinate and torque.
 GONE = 1e-12
-#: For a rigid arm, in the place of the lowest bending frequency [rad/s].
+#: Used for a rigid arm in place of the lowest bending frequency [rad/s].
 RIGID = 10.0
 
 
@@ -29,7 +29,7 @@ def lowest(model, q=None):
 
 
 def fading_rate(model, q=None):
-    """Rate at which jumps of an arm's signals fade, lambda [1/s]; joints at q, straight if not given."""
+    """Rate at which jumps of an arm's signals fade, lambda [1/s], with the joints at q; without q, straight."""
     return FADING * lowest(model, q)
 
 
@@ -39,14 +39,14 @@ class Fading:
     Parameters
     ----------
     size : int
-        Of the signal that jumps.
+        Size of the signal that jumps.
     rate : float
         lambda [1/s].
     """
 
     def __init__(self, size, rate):
         self.rate = rate
-        # (c0 + c1 t + c2 t^2) e^{-lambda t} from now on: jumps add up in it, however many there were.
+        # (c0 + c1 t + c2 t^2) e^{-lambda t} from now on is the sum of all jumps, however many there were.
         self._c, self._active = np.zeros((3, size)), False
 
     @property
@@ -59,7 +59,7 @@ class Fading:
         self._c[:], self._active = 0.0, False
 
     def take(self, other):
-        """Take the jumps of another of the same size."""
+        """Take the jumps of another `Fading` of the same size."""
         self._c[:], self._active = other._c, other._active
 
     def advance(self, dt):

@@ -1,32 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""A low pass of torques: filters of first order with one corner, one after the other.
+r"""A low-pass filter of torques: first-order filters in series, all with the same corner frequency.
 
 .. math:: v_k = x_k + (v_{k-1} - x_k)\,e^{-\omega_c h}
 
-of each, exact for an input that is constant over the sample, whatever its length h. Bending modes beyond the corner
-meet a small loop gain in place of a delayed torque (gain stabilisation).
+Each filter is exact for an input that is constant over the sample, whatever its length h. Bending modes beyond the
+corner then meet a small loop gain instead of a delayed torque (gain stabilisation).
 """
 
 import numpy as np
 
 from flexarm_dynamics.parameters import parameter
 
-#: Filters one after the other.
+#: Number of filters in series.
 POLES = 2
 
 BANDWIDTH = parameter("bandwidth", 0.0, "rad/s", 0.0, 1e5).described(
-    "Corner of the low pass of the feedback's torque; 0.0: none."
+    "Corner of the low-pass filter of the feedback torque; 0.0: no filter."
 )
 
 
 class LowPass:
-    """The low pass of n torques; without a corner it passes all.
+    """The low-pass filter of n torques; without a corner it passes everything.
 
     Parameters
     ----------
     n : int
     corner : float
-        [rad/s]; 0: none.
+        [rad/s]; 0: no filter.
     """
 
     def __init__(self, n, corner):
@@ -34,16 +34,16 @@ class LowPass:
         self._states = np.zeros(POLES * n)  # of one filter after the other
 
     def reset(self):
-        """Begin anew: the next input is passed as it is."""
+        """Start again: the next input is passed unchanged."""
         self._fresh = True
 
     def resume(self, other):
-        """Go on from another one's states, if it has any."""
+        """Go on from the states of another filter, if it has any."""
         self._states[:] = other._states
         self._fresh = other._fresh or not other._corner
 
     def shift(self, torque):
-        """What is passed is more by a torque (n,) from now on, without delay: what comes in is, too."""
+        """Raise the output by a torque (n,) from now on, without delay, because the input rises by the same torque."""
         self._states += np.tile(torque, POLES)
 
     def advance(self, dt):
@@ -51,7 +51,7 @@ class LowPass:
         self._kept = np.exp(-self._corner * dt)
 
     def state_space(self, dt):
-        r"""Of samples `dt` [s] apart: :math:`w' = A w + B x,\; v = C w + D x`; four matrices."""
+        r"""The four matrices of :math:`w' = A w + B x,\; v = C w + D x` for samples `dt` [s] apart."""
         n, kept = self._states.size // POLES, np.exp(-self._corner * dt)
         rows, through = np.zeros((n, POLES * n)), np.eye(n)
         A, B = np.zeros((POLES * n, POLES * n)), np.zeros((POLES * n, n))
@@ -63,7 +63,7 @@ class LowPass:
         return A, B, rows, through
 
     def __call__(self, torque):
-        """Pass a torque, shape (n,), in place."""
+        """Filter a torque, shape (n,), in place."""
         if not self._corner:
             return torque
         if self._fresh:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Gains that change with the configuration: the mean of several sets, each made for a configuration of its own.
+r"""Gains that change with the configuration: a weighted mean of several sets, each made for its own configuration.
 
 .. math::
     K(q) = \sum_k w_k(q)\,K_k, \qquad w_k = \frac{d_k^{-2}}{\sum_l d_l^{-2}}, \qquad
     d_k^2 = \sum_j 4\sin^2\tfrac{q_j - q_{kj}}2,
 
-the interpolation of Shepard (1968): where set k was made, K is K_k and its derivative zero. The sum
-runs over the joints that change the arm's equations; the first joint of a planar arm without gravity does not. About
-rest with no error the derivatives of K multiply zero, so that the linear loop in a configuration is that of K(q) there.
+This is the interpolation of Shepard (1968): in the configuration of set k, K is K_k and its derivative is zero. The sum
+over j includes only joints that change the arm's equations; the first joint of a planar arm without gravity does not.
+At rest without error the derivatives of K multiply zero. So the linearised loop in a configuration q is that of K(q).
 """
 
 import numpy as np
@@ -17,11 +17,11 @@ from flexarm_dynamics.parameters import parameter
 
 from . import kernels
 
-#: Change of the equations with a joint below which it does not matter, relative.
+#: Relative change of the equations with a joint below which the joint does not matter.
 NEGLIGIBLE = 1e-9
 SCHEDULE = parameter("schedule", [], "rad", -100.0, 100.0, kind="float_array").described(
-    "Configurations of the sets of gains, one after the other; between them the gains are interpolated. Empty: one set"
-    " for all."
+    "Configurations of the sets of gains, one after the other; the gains are interpolated between them. Empty: one set"
+    " for all configurations."
 )
 
 
@@ -54,19 +54,19 @@ class Schedule:
     ----------
     model : ArmModel
     configurations : array_like, shape (k, n) or (k n,)
-        One for each set [rad]; none, or one: the same gains everywhere.
+        One for each set of gains [rad]; with none or one, the gains are the same everywhere.
     field : str
         Name of the parameter, for errors.
 
     Attributes
     ----------
     count : int
-        Of sets.
+        Number of sets.
 
     Raises
     ------
     ParameterError
-        For no whole number of configurations.
+        If the number of angles gives no whole number of configurations.
     """
 
     def __init__(self, model, configurations, field="schedule"):
@@ -84,13 +84,13 @@ class Schedule:
         self._weights = np.full(self.count, 1.0 / self.count)
 
     def weights(self, q):
-        """w(q), shape (count,); overwritten by the next call. The control path."""
+        """w(q), shape (count,), overwritten by the next call; runs on the control path."""
         if self._matters.size:
             kernels.compiled().weights_between(q, self.at, self._matters, self._weights)
         return self._weights
 
     def blend(self, q, sets, out):
-        """Fill `out`, (size,), with the mean of `sets`, (count, size), at q (n,). The control path."""
+        """Fill `out`, (size,), with the mean of `sets`, (count, size), at q (n,); runs on the control path."""
         if self.count > 1:
             np.dot(self.weights(q), sets, out=out)
         else:
@@ -102,7 +102,7 @@ class Schedule:
         Raises
         ------
         ParameterError
-            For another number of sets than of configurations.
+            If the number of sets differs from the number of configurations.
         """
         if not size:  # a rigid arm has no modes to feed back
             return np.zeros((self.count, 0))

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors that flexarm raises; every one of them is a `FlexarmError`.
+"""Defines the errors that flexarm raises; each of them is a `FlexarmError`.
 
-An error carries what a program or a test wants to know (`field`, `value`, `limit`, `hint`), and there is one way in
-which it is written out for people: ``field: value problem (limit); hint``, without the parts that are not given.
+An error carries what a program or a test needs (`field`, `value`, `limit`, `hint`). Its text for people always has the
+form ``field: value problem (limit); hint``, without the parts that are not given.
 """
 
 import numpy as np
 
 from .shown import show
 
-#: Values beyond this are no measurement of an arm [rad, m, rad/s, m/s].
+#: Values beyond this can't be a measurement of an arm [rad, m, rad/s, m/s].
 MAX_MEASUREMENT = 1e6
 
 
@@ -44,7 +44,7 @@ class FlexarmError(Exception):
     Attributes
     ----------
     problem, field, value, limit, hint
-        As given; empty strings, `NOT_GIVEN` for the value and None for the limit where nothing was.
+        As given. What was not given is an empty string, `NOT_GIVEN` (value) or None (limit).
 
     Examples
     --------
@@ -67,7 +67,7 @@ class FlexarmError(Exception):
         return f"{text}; {self.hint}" if self.hint else text
 
     def __reduce__(self):
-        """Errors travel between processes with all that they carry."""
+        """Make errors keep all that they carry when they are sent to another process."""
         return _again, (type(self), vars(self))
 
 
@@ -101,7 +101,7 @@ class ShapeError(FlexarmError):
 
 
 class ModelError(FlexarmError):
-    """An arm for which there is no model, or a model asked for what it has not."""
+    """An arm for which there is no model, or a request that a model does not support."""
 
 
 class DesignError(FlexarmError):
@@ -131,7 +131,7 @@ def check_finite(values, names, field):
     ----------
     values : ndarray, shape (k,)
     names : sequence of str
-        Of the joints or modes that the values belong to.
+        Names of the joints or modes that the values belong to.
     field : str
         Field of the message, such as ``joint_position``.
 
@@ -141,7 +141,7 @@ def check_finite(values, names, field):
         Naming the first bad value and its joint or mode.
     """
     if values.dot(values) < MAX_MEASUREMENT:
-        return  # so is every usable sample, and one product costs a third of what follows
+        return  # true for every usable sample; this product costs a third of what follows
     if not np.abs(values).max(initial=0.0) < MAX_MEASUREMENT:  # false for NaN too
         i = int(np.argmin(np.abs(values) < MAX_MEASUREMENT))
         value, where = float(values[i]), f"{field} of {names[i]}"

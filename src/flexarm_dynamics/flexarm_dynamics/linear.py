@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Linear systems: Jacobians by central differences, the arm linearised at rest, and exact sampling.
+r"""Linear systems: computes Jacobians by central differences, linearises the arm, and samples exactly.
 
 A system :math:`\dot s = As + Bu` whose input is held over a period T (zero-order hold) moves exactly by
 
@@ -29,7 +29,7 @@ def jacobian(function, x, step=STEP):
         Takes an array like `x`, returns an array of shape (N,).
     x : array_like, shape (k,)
     step : float
-        Half the distance of the two points of a difference, the same for every place of `x`.
+        Half the distance between the two points of a difference, the same for every entry of `x`.
 
     Returns
     -------
@@ -55,8 +55,8 @@ def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
     torque : ndarray, shape (n,), or 0.0
         [N m]
     coulomb : bool
-        With Coulomb friction as steep as its smoothing makes it at rest, as a law that compensates it takes it to
-        be; False: with viscous friction only, as when the arm moves.
+        True: Coulomb friction is as steep as its smoothing makes it at rest; a law that compensates friction assumes
+        the same. False: viscous friction only, as when the arm moves.
     step : float
         Of the differences.
 
@@ -104,11 +104,11 @@ def linear_plant(model, q, coulomb=True):
 
 
 def moving_plant(model, q, velocity, acceleration):
-    r"""The arm (2) linearised about a motion, at one time of it: "frozen" there.
+    r"""The arm (2) linearised about a motion, "frozen" at one time of it.
 
-    Its links are bent as slow motions bend them, :math:`K_2\delta = -f_2(q, \dot q) - M_{21}\ddot q`, the torque is the
-    one that gives the joints their acceleration, and Coulomb friction is what it is in a joint that moves on: constant.
-    At rest it is `linear_plant` without Coulomb friction, but for products of deflections and weight.
+    The links are bent as in a slow motion, :math:`K_2\delta = -f_2(q, \dot q) - M_{21}\ddot q`. The torque gives the
+    joints their acceleration. Coulomb friction is constant, as in a joint that keeps moving. At rest the result is
+    `linear_plant` without Coulomb friction, except for products of deflections and weight.
 
     Parameters
     ----------
@@ -131,7 +131,8 @@ def moving_plant(model, q, velocity, acceleration):
     free = np.array(model.derivative(state, np.zeros(n)))
     B = jacobian(lambda u: model.derivative(state, u), np.zeros(n), step=1.0)
     torque = np.linalg.solve(B[joints], acceleration - free[joints])
-    # `state_matrix` has viscous friction alone: what Coulomb friction takes at this speed, it takes all the time.
+    # `state_matrix` has viscous friction alone. Coulomb friction takes the same torque all the time, its value at this
+    # speed.
     taken = model.friction(velocity, state[n : n + m], np.zeros(m))
     torque -= taken - model.friction_table()[:, 0] * velocity
     return state_matrix(model, state, torque, coulomb=False), B
@@ -220,7 +221,8 @@ def sampled_noise(A, density, period):
     ndarray, shape (N, N)
         Symmetric.
     """
-    # Van Loan's exponential holds e^(-At), which grows: over a step in which no mode decays much, then doubled.
+    # Van Loan's exponential contains e^(-At), which grows: compute it over a step in which no mode decays much, then
+    # double.
     N = A.shape[0]
     fastest = np.abs(np.linalg.eigvals(A)).max()
     doublings = max(0, int(np.ceil(np.log2(max(fastest * period, 1.0)))))

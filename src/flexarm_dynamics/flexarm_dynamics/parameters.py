@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Declared parameters: one declaration gives type, unit, range, default and description.
+"""Declares parameters: one declaration gives type, unit, range, default and description.
 
-From it come the validation, the ROS parameter descriptors and the tables in the documentation.
-Nothing here knows ROS.
+The validation, the ROS parameter descriptors and the tables in the documentation come from it. Nothing here knows ROS.
 """
 
 import math
@@ -35,7 +34,7 @@ class Parameter:
     kind : str
         One of `KINDS`.
     default : object
-        The default. A float array of one element stands for that value in every place.
+        The default. A float array of one element means this value in every place.
     description : str
         What it does, in a sentence.
     unit : str
@@ -176,7 +175,7 @@ def parameter(name, default, unit="-", low=None, high=None, *, kind=None, **opti
     Parameters
     ----------
     name, default, unit, low, high, kind
-        As of `Parameter`; `kind` is needed where the default does not show it: an empty list, or None.
+        As in `Parameter`; `kind` is needed if the default does not show it: an empty list, or None.
     **options
         The other fields of `Parameter`: `choices`, `length`, `read_only`.
 
@@ -205,7 +204,7 @@ def _refusal(where, value, problem, **more):
 
 
 def _listed(where, value, what):
-    """The entries of what is a list, an array or the like."""
+    """The entries of a list, an array or the like."""
     if not isinstance(value, str) and hasattr(value, "__len__"):
         try:
             return list(value)
@@ -265,9 +264,9 @@ def check_all(declared, values, sizes=None, prefix=""):
 
 
 def merge(*groups):
-    """Declarations of several components under one prefix; a name means one thing.
+    """Merge declarations of several components under one prefix; a name has one meaning.
 
-    Where one takes sets and another a single set, the name takes sets; each component checks its own.
+    If one component takes several sets and another a single set, the name takes several; each component checks its own.
 
     `groups` are sequences of `Parameter`.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes beside the control path: they give way to it, and end with the process that started them."""
+"""Makes processes beside the control path give way to it, and end with the process that started them."""
 
 import contextlib
 import ctypes
@@ -23,7 +23,7 @@ def step_back(niceness, cpus=()):
     niceness : int
         Added to the present one.
     cpus : collection of int
-        To run on, where the system allows it; empty: those inherited.
+        CPUs to run on, if the system allows it; empty: those inherited.
     """
     if hasattr(os, "SCHED_BATCH"):  # Linux
         # Not SCHED_IDLE: on a machine that is always busy such a process would never run.
@@ -36,7 +36,7 @@ def step_back(niceness, cpus=()):
 
 
 def end_with(parent):
-    """End this process as soon as its parent has ended, however that ends; Linux, elsewhere nothing is done.
+    """End this process as soon as its parent has ended for any reason; on systems other than Linux, do nothing.
 
     Parameters
     ----------

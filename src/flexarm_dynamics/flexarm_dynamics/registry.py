@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Components found by name through Python entry points, so that a user's package adds one."""
+"""Finds components by name through Python entry points, so a user's package can add one."""
 
 import difflib
 import warnings
@@ -16,11 +16,11 @@ def names(group):
 
 
 def importable(group):
-    """Name to class of what can be imported; one broken package does not take the others with it.
+    """Classes by name of the components that can be imported; a broken package does not affect the others.
 
-    What can't be imported is an error when it is asked for, by `find`.
+    A component that can't be imported is an error only when `find` asks for it.
 
-    `group` is an entry-point group, ``flexarm.slow_laws`` say.
+    `group` is an entry-point group, for example ``flexarm.slow_laws``.
     """
     found = {}
     for name in names(group):
@@ -38,7 +38,7 @@ def find(group, name):
     Raises
     ------
     UnknownComponentError
-        Listing what there is; or saying why a registered one can't be imported.
+        With a list of the available names, or with the reason why a registered class can't be imported.
     """
     found = [e for e in entry_points(group=group) if e.name == name]
     if not found:

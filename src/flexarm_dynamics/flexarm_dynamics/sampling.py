@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Exact sampling of one linear system over periods that differ from sample to sample, without exponentials.
+r"""Samples one linear system exactly over periods that differ from sample to sample, without exponentials.
 
-A loop whose samples get lost, or whose stamps jitter, asks for another period at every sample. With :math:`\Phi(h) =
+A loop whose samples get lost, or whose stamps jitter, needs another period at every sample. With :math:`\Phi(h) =
 e^{Ah}`, :math:`\Gamma(h) = \int_0^h e^{As}ds` and :math:`Q(h) = \int_0^h e^{As}Se^{A^Ts}ds`, steps add up,
 
 .. math::
     \Phi(h_0 + e) = \Phi(e)\Phi(h_0), \quad \Gamma(h_0 + e) = \Gamma(h_0) + \Phi(h_0)\Gamma(e), \quad
     Q(h_0 + e) = \Phi(e)Q(h_0)\Phi(e)^T + Q(e),
 
-so that multiples :math:`h_0` of a short period g come from that period by doubling, and are kept. The rest e, below g,
-and the period g itself are a Taylor series whose terms do not depend on e:
+so steps over multiples :math:`h_0` of a short period g come from that over g by doubling, and are kept. The steps over
+the rest e, below g, and over g itself are Taylor series whose coefficients do not depend on e:
 
 .. math::
     \Phi(e) = \sum_k \frac{e^k}{k!}A^k, \quad \Gamma(e) = \sum_k \frac{e^{k+1}}{(k+1)!}A^k, \quad
     Q(e) = \sum_k \frac{e^{k+1}}{(k+1)!}L^kS, \quad L X = AX + XA^T.
 
-With x = :math:`\|A\|g`, the norm taken after balancing, the remainder of the first series after K terms is below
-:math:`x^K/K!\cdot e^x` in the balanced norm, that of the others below :math:`(2x)^K/K!\cdot e^{2x}` of their size. g is
-chosen for x below `REACH`, and K so that both are below `ERROR`. A positive rest only ever adds covariances, so nothing
-cancels.
+With x = :math:`\|A\|g`, where the norm is taken after balancing, the remainder of the first series after K terms is
+below :math:`x^K/K!\cdot e^x` in the balanced norm, and that of the others below :math:`(2x)^K/K!\cdot e^{2x}` of their
+size. g is chosen so that x is below `REACH`, and K so that both remainders are below `ERROR`. A positive rest only ever
+adds covariances, so nothing cancels.
 """
 
 from dataclasses import dataclass, replace
@@ -101,7 +101,7 @@ class Sampling:
         return out.reshape(count + 1, -1)
 
     def _multiple(self, k):
-        """The step over k short periods: that over half of them twice, and once the short one if k is odd."""
+        """The step over k short periods: twice the step over half of them, and one short step more if k is odd."""
         if k == 1:
             return self._short(self.grid)
         half = self._kept(k // 2)

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Values as messages for people show them: cut short, whatever they are."""
+"""Formats any value for a message to people, cut short."""
 
 import reprlib
 
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = 80
-#: So many of a list's entries are shown.
+#: Number of a list's entries that are shown.
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxset = _REPR.maxdict = _REPR.maxarray = 12
 _REPR.maxlevel = 3
-#: No value takes more room in a message [characters].
+#: Max. length of a value in a message [characters].
 MAX_LENGTH = 400
 
 
 def show(value):
-    """Any value as text: a sender's list may be as long as it likes, a log line may not."""
+    """Any value as text, cut short: a sender's list may have any length, a log line may not."""
     try:
         text = _REPR.repr(value)
-    except Exception:  # a value's own repr may raise, and an int too long for one does
+    except Exception:  # a value's own repr may raise, and that of a very long int does
         return f"a {type(value).__name__}"
     return text if len(text) <= MAX_LENGTH else f"{text[:MAX_LENGTH]}…"
 
@@ -25,7 +25,7 @@ def number(value):
     """A number as text, without its type; an integer of a thousand digits cut short, too."""
     try:
         text = str(value)
-    except ValueError:  # Python writes no longer ones in decimals
+    except ValueError:  # Python does not write longer ones in decimals
         return show(value)
     return text if len(text) <= 80 else f"{text[:80]}…"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Slow and fast subsystems of an arm (Siciliano & Book 1986, section 3).
+r"""Computes the slow and the fast subsystem of an arm (Siciliano & Book 1986, section 3).
 
 Everything is computed from the `Terms` of (2) taken without deflections: the paper's assumptions a) and b).
 Names follow the paper: x = (q, qd), z = (delta, delta_d), a bar for the slow subsystem.
@@ -105,7 +105,7 @@ def slow_subsystem(terms):
 def slow_torque(terms, acceleration):
     r"""Torque that gives the slow subsystem (10) an acceleration: :math:`\bar u = B^{-1}(\ddot q - a)`.
 
-    From the joint rows of (2) with the modes at rest under their own rows, without inverting anything twice:
+    It follows from the joint rows of (2), with the modes at rest by their own rows; nothing is inverted twice:
 
     .. math:: \bar u = M_{11}\ddot q + f_1 - K_1 K_2^{-1}(M_{21}\ddot q + f_2)
 
@@ -155,7 +155,7 @@ def is_stabilisable(A, B, margin=0.0):
     worst = np.inf
     size = A.shape[0]
     norm = np.linalg.norm(A)
-    # Balanced, and each eigenvalue on its own scale: else stiff modes hide what the input does to soft ones.
+    # Balance, and scale for each eigenvalue: otherwise stiff modes hide the input's effect on soft ones.
     balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
     B = B / units[:, None]
     gain = np.linalg.norm(B) or 1.0
@@ -234,7 +234,7 @@ def full_order_matrix(terms, kp, kv, B_inverse, K_f):
     kp, kv : array_like, shape (n,)
         Slow gains [1/s^2], [1/s].
     B_inverse : ndarray, shape (n, n)
-        What the slow law multiplies by: the inverse of B, or 1/h11 as published [kg m^2].
+        Factor in the slow law: the inverse of B, or 1/h11 as published [kg m^2].
     K_f : ndarray, shape (n, 2m)
         Gain of (15), u_f = K_f z_f; zero for slow control alone.
 
@@ -263,8 +263,8 @@ def full_order_matrix(terms, kp, kv, B_inverse, K_f):
 def frequencies_and_damping(eigenvalues):
     """Natural frequency [rad/s] and damping ratio of each conjugate pair or pair of real poles, ascending.
 
-    Real poles are paired by ascending magnitude; one that is left alone counts as a pair of equal ones.
-    Unstable pairs have a negative damping ratio.
+    Real poles are paired by ascending magnitude; a pole that is left alone counts as a pair of equal poles. Unstable
+    pairs have a negative damping ratio.
 
     The `eigenvalues` are of a real matrix, in any order [rad/s].
     """

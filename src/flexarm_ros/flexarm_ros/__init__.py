@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes share: parameters, life cycle, quality of service, messages to arrays and back."""
+"""Gives the nodes what they share: parameters, life cycle, quality of service, messages to arrays and back."""

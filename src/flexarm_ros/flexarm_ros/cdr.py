@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Messages whose strings and lengths seldom change, read from their bytes and written to them.
+r"""Reads messages from their bytes, and writes them, if their strings and lengths seldom change.
 
 The middleware carries XCDR1 (OMG DDS-XTypes 1.3, section 7.4.1): four bytes of encapsulation, then the fields one after
 the other, each aligned to its own size, with a length before each string and array. On the control path only numbers
-change from one message to the next. So one message tells where they are; whether another one has the same strings and
-lengths is one comparison of all its bytes, as one whole number, without those of numbers and padding. Arrays are views
-of the bytes. rclpy's conversion goes through each attribute and string instead, which takes several times as long.
+change from one message to the next. So one message shows where the numbers are. One comparison shows whether another
+message has the same strings and lengths: it compares all bytes as one whole number, without those of numbers and
+padding. Arrays are views of the bytes. rclpy's conversion takes several times as long, because it goes through each
+attribute and string.
 """
 
 import struct
@@ -22,7 +23,7 @@ LITTLE = sys.byteorder == "little"
 ENCAPSULATION, ORDER = (b"\0\1", "<") if LITTLE else (b"\0\0", ">")
 #: Bytes before the fields; alignment counts from there.
 HEAD = 4
-#: Numbers: format of `struct`, and size, which is the alignment.
+#: Formats of numbers in `struct`, and their size, which is also their alignment.
 NUMBERS = {
     "boolean": ("?", 1),
     "uint8": ("B", 1),
@@ -42,12 +43,12 @@ def _several(paths):
 
 
 class Layout:
-    """Where the numbers of a message are in its bytes, as long as its strings and lengths are these.
+    """Where the numbers are in the bytes of all messages that have these strings and lengths.
 
     Parameters
     ----------
     message : object
-        Of a kind that has numbers of `NUMBERS`, strings, arrays of doubles and of strings, and fields of such kinds.
+        Its type has numbers of `NUMBERS`, strings, arrays of doubles and of strings, and fields of such types.
 
     Attributes
     ----------
@@ -76,8 +77,8 @@ class Layout:
         self._struct = struct.Struct("".join(form))
 
     def unpack(self, raw):
-        """The `numbers` of a message's bytes; None where its strings or lengths are others."""
-        if len(raw) < self._size:  # what is beyond it is the middleware's padding
+        """The `numbers` in a message's bytes; None if its strings or lengths are others."""
+        if len(raw) < self._size:  # bytes beyond it are the middleware's padding
             return None
         if int.from_bytes(raw, "little") & self._whole != self._known:
             return None
@@ -85,7 +86,7 @@ class Layout:
 
     @staticmethod
     def doubles(raw):
-        """All that may be doubles in a message's bytes; not aligned for the processor."""
+        """View of a message's bytes as doubles; not aligned for the processor."""
         return np.frombuffer(raw, ORDER + "f8", (len(raw) - HEAD) // 8, HEAD)
 
     def bytes_of(self, path):
@@ -94,7 +95,7 @@ class Layout:
         return slice(HEAD + 8 * place.start, HEAD + 8 * place.stop)
 
     def runs(self):
-        """Numbers that follow each other: of each run its `struct.Struct`, place, and slice of the numbers."""
+        """Runs of adjacent numbers: for each its `struct.Struct`, its place, and its slice of the numbers."""
         found, items = [], list(self.numbers.values())
         begin = 0
         for i in range(1, len(items) + 1):
@@ -161,7 +162,7 @@ class Fields:
     Attributes
     ----------
     layout : Layout
-        Where they are from: while it is the same object, so are all strings and lengths.
+        The layout that was used: while it is the same object, all strings and lengths are the same, too.
     doubles : ndarray
         As `Layout.doubles`.
     """
@@ -208,7 +209,7 @@ class Reader:
         Raises
         ------
         MessageError
-            For bytes that are no message of this kind.
+            For bytes that are not a message of this kind.
         """
         if not isinstance(raw, bytes):
             return raw
@@ -223,11 +224,11 @@ class Reader:
         return fields
 
     def _learn(self, raw):
-        """As a call, for bytes with other strings or lengths than the last ones."""
+        """As `__call__`, for bytes with other strings or lengths than the last ones."""
         message = self.message(raw)
         layout = self._layout = Layout(message)
         fields = self._fields = Fields(message, layout)
-        # As numbers follow each other: in most messages those of the header first.
+        # In the order of the numbers: in most messages those of the header come first.
         self._groups, owners = [], [path.rpartition(".")[::2] for path in layout.numbers]
         for i, (owner, name) in enumerate(owners):
             if i == 0 or owner != owners[i - 1][0]:
@@ -238,14 +239,14 @@ class Reader:
             self._groups[-1] = attributes, names, slice(part.start, i + 1)
         if layout.unpack(raw) is not None:
             fields.doubles = layout.doubles(raw)
-        else:  # the other order of bytes, or strings without their end: only rclpy reads that
+        else:  # another byte order, or strings without their end: only rclpy reads these
             fields.doubles = np.zeros(max((a.stop for a in layout.arrays.values()), default=0))
             for path, place in layout.arrays.items():
                 fields.doubles[place] = attrgetter(path)(message)
         return fields
 
     def message(self, raw):
-        """The message itself, with all checks that rclpy makes; arguments and errors as of a call."""
+        """The message itself, with all checks that rclpy makes; arguments and errors are those of `__call__`."""
         if not isinstance(raw, bytes):
             return raw
         try:
@@ -298,7 +299,7 @@ class Writer:
 
 
 def _slots(message):
-    """From a path of fields to that of the slots behind rclpy's properties, each of which is a call of Python."""
+    """From a path of fields to that of the slots behind rclpy's properties; each property would be a call of Python."""
 
     def inside(path):
         slots = ".".join(f"_{name}" for name in path.split("."))

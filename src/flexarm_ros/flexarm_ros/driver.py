@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base class of drivers: write how to read a sample, apply torque, make the arm safe and close; the rest is here.
+"""Base class of drivers: you write how to read a sample, apply torque, make the arm safe and close; the rest is here.
 
-A driver publishes `arm_state` (and `joint_states`), takes `joint_torque`, and takes the safe action when in doubt:
-the rules are `TorqueGate`'s. The driver template, the adapter for ros2_control and the simulator are such drivers.
+A driver publishes `arm_state` (and `joint_states`), receives `joint_torque`, and takes the safe action in doubt;
+`TorqueGate` has the rules. The driver template, the adapter for ros2_control and the simulator are such drivers.
 """
 
 import os
@@ -45,10 +45,10 @@ class Sample:
     Attributes
     ----------
     number : int
-        Counts the samples: a lost one leaves a gap, and a number that does not rise begins a new session.
+        Counts the samples. A lost sample leaves a gap, and a number that does not rise begins a new session.
     stamp_ns : int or None
-        Time of measurement on this machine's ROS clock [ns]; None: not known yet, the sample is not published, and
-        the next one with a time begins a new session.
+        Time of measurement on this machine's ROS clock [ns]. None: not known yet; the sample is not published, and the
+        next sample with a time begins a new session.
     position : ndarray, shape (n,)
         [rad]
     velocity : ndarray, shape (n,), optional
@@ -72,7 +72,7 @@ class Sample:
 
 
 class Thinned:
-    """Says which samples a topic of a lower rate takes: called with each stamp, it is true for those that are due.
+    """Selects the samples for a topic of a lower rate: called with each stamp, it is true for those that are due.
 
     Parameters
     ----------
@@ -100,9 +100,9 @@ def new_session():
 class Driver(ArmNode):
     """A node between the topics and an arm. Subclasses implement the methods of the first group.
 
-    `read` runs in a thread of its own, all others in the node's thread, or in that one, under a lock: never two
-    at a time. A driver whose samples come as ROS messages, or that moves on its own grid of time, overrides
-    `connect`, `start` and `stop` and calls `publish` itself, and `begin_session` where the device has restarted.
+    `read` runs in a thread of its own. All others run in the node's thread, or in that of `read`, under a lock: never
+    two at a time. A driver whose samples come as ROS messages, or that moves on its own grid of time, overrides
+    `connect`, `start` and `stop`. It calls `publish` itself, and `begin_session` if the device has restarted.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Driver(ArmNode):
         From the parameter `arm`, when `open` is called.
     gate : TorqueGate
     fault : str
-        Why the device can't be used; empty where it can.
+        Why the device can't be used; empty if it can.
     safe : bool
         Whether the last action was the safe one.
     """
@@ -131,12 +131,12 @@ class Driver(ArmNode):
         """Open the device, by `self.parameters` and `self.arm`; raise a FlexarmError to refuse."""
 
     def read(self):
-        """Wait for the device, at most `SILENT` seconds; an iterable of the `Sample`s that have come.
+        """Wait for the device, at most `SILENT` seconds; return an iterable of the `Sample`s that have come.
 
         Raises
         ------
         FlexarmError
-            When the device is gone: reading ends, and the error stands in `/diagnostics`.
+            If the device is gone: reading ends, and `/diagnostics` shows the error.
         """
         raise NotImplementedError
 
@@ -186,17 +186,17 @@ class Driver(ArmNode):
         self.connect(self.make_subscription(JointTorque, "joint_torque", self._on_torque, raw=True))
 
     def make_gate(self):
-        """The rules with this driver's timeout."""
+        """The `TorqueGate` with this driver's timeout."""
         return TorqueGate(self.arm, self.parameters["torque_timeout"])
 
     def connect(self, torques):
-        """Make the subscription of `joint_torque` the control path, and watch over its timeout."""
+        """Make the subscription of `joint_torque` the control path, and monitor its timeout."""
         self.make_control_path(torques)
-        # If the samples stop as well, the torque still ends.
+        # The torque ends also if the samples stop, too.
         self.make_timer(self.gate.timeout / 2.0, self.watch)
 
     def now(self):
-        """Steady clock of the freshness of torques [s]."""
+        """Steady clock on which the age of torques is measured [s]."""
         return time.monotonic()
 
     def start(self):
@@ -219,9 +219,9 @@ class Driver(ArmNode):
     def begin_session(self):
         """Begin a new session: the device has restarted, or its zeros may have changed.
 
-        There is no torque until a controller has answered in the new session; one that was in motion is in fault then.
-        Samples whose numbers do not rise, that come after `SILENT` seconds without any, or after one without a time,
-        begin one by themselves, and so does each activation.
+        There is no torque until a controller has answered in the new session; a controller that was in motion goes into
+        fault. A new session begins automatically with each activation, and with a sample whose number does not rise,
+        that comes after `SILENT` seconds without any, or that follows a sample without a time.
         """
         with self._lock:
             self._first = None  # stamps begin anew with the next sample
@@ -247,7 +247,7 @@ class Driver(ArmNode):
                 self.fault = f"the device sends nothing for {SILENT:g} s"
 
     def _number(self, sample):
-        """Publish a sample of the device under its sequence in the session."""
+        """Publish a sample of the device with its sequence in the session."""
         now = self.now()
         if self._last is not None and (
             sample.number <= self._last or sample.stamp_ns is None or now - self._arrived > SILENT
@@ -264,14 +264,14 @@ class Driver(ArmNode):
         self.watch()
 
     def publish(self, sample):
-        """Publish a `Sample`, whose number is its sequence in the session, and note when."""
+        """Publish a `Sample` whose number is its sequence in the session, and note the time."""
         with self._lock:
             self.fill(sample, self.gate.sent(sample.number, self.now()))
             self.state_publisher.publish(self.state_bytes())
         self.publish_joints(sample)
 
     def fill(self, sample, controller_id):
-        """Write a sample into the message of `arm_state`, and whose answer to it will act."""
+        """Write a sample into the message of `arm_state`, and the id of the controller whose answer to it will act."""
         writer = self.writer
         writer.head(sample.stamp_ns, self.gate.session, sample.number, controller_id)
         doubt = self.gate.controllers.doubt(self.now())
@@ -285,7 +285,7 @@ class Driver(ArmNode):
         self._published += 1
 
     def publish_joints(self, sample):
-        """Publish `joint_states` where it is due, for RViz and the like."""
+        """Publish `joint_states` when it is due, for RViz and the like."""
         if self._joint_publisher is None:
             return
         due = self._joints_due(sample.stamp_ns, sample.number == 0)

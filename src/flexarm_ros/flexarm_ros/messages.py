@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages to arrays and back, without copies that are not needed.
+"""Converts messages to arrays and back, without unnecessary copies.
 
 Numbers are cast here: a Python int or numpy scalar assigned to a float64 field is published as garbage.
 """
@@ -30,7 +30,7 @@ def set_stamp(stamp, ns):
 
 
 class _Columns:
-    """Names and values of one group of arrays, in the arm's order whatever the sender's."""
+    """Names and values of one group of arrays, in the arm's order whatever the order of the sender."""
 
     def __init__(self, field, names):
         self.field, self.names = field, list(names)
@@ -38,7 +38,7 @@ class _Columns:
         self._seen = self.names
 
     def order(self, names):
-        """None where `names` are in the arm's order, else an index array."""
+        """None if `names` are in the arm's order, otherwise an index array."""
         if names == self._seen:
             return self._order
         if sorted(names) != sorted(self.names):
@@ -60,7 +60,7 @@ class _Columns:
 
     @property
     def present(self):
-        """Index array of the last names, None where they are in the arm's order."""
+        """Index array of the last names; None if they are in the arm's order."""
         return self._order
 
     def read(self, field, values, order, out):
@@ -93,11 +93,11 @@ class StateReader:
         self._strain = np.zeros(len(arm.gauges))
         self._amplitude = np.zeros(len(arm.observed_modes))
         self._rate = np.zeros(len(arm.observed_modes))
-        # Of the last message that was read name by name: its layout, and where its numbers go.
+        # Layout of the last message that was read name by name, and where its numbers go.
         self._layout, self._copies = None, ()
 
     def read(self, msg, sample):
-        """Fill `sample`; stamp, session and sequence even when the rest is refused.
+        """Fill `sample`; its stamp, session and sequence are filled even if the rest is refused.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class StateReader:
             For names or lengths that are not this arm's, nanoseconds of a second and more, or an unknown trust.
         """
         stamp = msg.header.stamp
-        # The answer to a refused message carries its stamp: it must be one that a message can hold.
+        # The answer to a refused message carries the same stamp, so a message must be able to hold it.
         sample.stamp_ns = stamp.sec * SECOND + min(stamp.nanosec, SECOND - 1)
         sample.session, sample.sequence = msg.session, msg.sequence
         sample.controller_id, sample.doubt = msg.controller_id, msg.doubt
@@ -131,7 +131,7 @@ class StateReader:
             self._layout, self._copies = layout, self._planned(layout)
 
     def _read_arrays(self, msg, sample):
-        """Fill the arrays of a sample, by all names and lengths."""
+        """Fill the arrays of a sample, with a check of all names and lengths."""
         joints = self._joints
         order = joints.order(msg.joint_names)
         if not joints.read("joint_position", msg.joint_position, order, sample.position):
@@ -168,7 +168,7 @@ class StateReader:
         return np.concatenate(places), flat, [None if e is None else flat[e] for e in ends]
 
     def _copy(self, doubles, sample):
-        """As `_read_arrays`, from the numbers of a message of the last one's layout."""
+        """As `_read_arrays`, from the numbers of a message with the same layout as the last one."""
         places, flat, (position, velocity, torque, strain, amplitude, rate) = self._copies
         doubles.take(places, out=flat, mode="clip")
         sample.position[:] = position
@@ -182,8 +182,8 @@ class StateReader:
 def _floats(msg, field, size):
     """Size an array field and return a view of it to write into.
 
-    The view is of the message's own array, which the setter makes: assigning to the field again would
-    leave the view behind.
+    The view shows the message's own array, which the setter makes. After another assignment to the field, the view
+    would show the old array.
     """
     setattr(msg, field, array("d", bytes(8 * size)))
     return np.frombuffer(getattr(msg, field)) if size else np.zeros(0)
@@ -201,7 +201,7 @@ class StateWriter:
         self._views = {}
 
     def head(self, stamp, session, sequence, controller_id=0):
-        """Write stamp [ns], session, sequence, and whose torque acts."""
+        """Write stamp [ns], session, sequence, and the id of the controller whose torque acts."""
         msg = self.message
         set_stamp(msg.header.stamp, stamp)
         msg.session, msg.sequence, msg.controller_id = session, sequence, controller_id
@@ -227,7 +227,7 @@ class TorqueWriter:
     ----------
     arm : Arm
     controller_id : int, optional
-        Tells two controllers of one arm apart, never 0: a random one at each start, if not given.
+        Tells two controllers of one arm apart; never 0. If not given, it is random at each start.
     """
 
     def __init__(self, arm, controller_id=None):
@@ -251,7 +251,7 @@ class TorqueWriter:
 class TorqueReader:
     """Reads `JointTorque` messages for an `arm`."""
 
-    #: A torque beyond this is no torque [N m].
+    #: A value beyond this can't be a torque [N m].
     HUGE = 1e9
 
     def __init__(self, arm):
@@ -259,12 +259,12 @@ class TorqueReader:
         self._torque = np.zeros(len(arm.joints))
 
     def read(self, msg):
-        """The torques (n,) [N m], or None where the message says DISABLED.
+        """The torques (n,) [N m], or None if the message has the mode DISABLED.
 
         Raises
         ------
         MessageError
-            For wrong names, lengths, a mode that is neither, or values that are not finite.
+            For wrong names or lengths, an unknown mode, or values that are not finite.
         """
         if msg.mode == JointTorque.DISABLED:
             return None
@@ -276,7 +276,7 @@ class TorqueReader:
         ):
             raise MessageError("is empty", field="torque")
         torque = self._torque
-        if torque.dot(torque) < self.HUGE:  # so are nearly all
+        if torque.dot(torque) < self.HUGE:  # true for nearly all
             return torque
         if not np.abs(torque).max() < self.HUGE:
             i = int(np.argmin(np.abs(self._torque) < self.HUGE))
@@ -313,7 +313,7 @@ class CompositeStateWriter:
         }
 
     def fill(self, sample, controller, compute_time, parameters_set=""):
-        """Copy what the controller holds; `compute_time` in seconds, `parameters_set` as `Designs.last_change`."""
+        """Copy the controller's values; `compute_time` in seconds, `parameters_set` as `Designs.last_change`."""
         msg, a = self.message, self._arrays
         set_stamp(msg.header.stamp, sample.stamp_ns)
         msg.session, msg.sequence = sample.session, sample.sequence
@@ -337,7 +337,7 @@ class ObserverStateWriter:
         msg.mode_names, msg.gauge_names = list(arm.observed_modes), list(arm.gauge_names)
 
     def fill(self, sample, name, observer, strain, health=None):
-        """Copy what the observer holds; without `health` (gauges,), every finite gauge is good."""
+        """Copy the observer's values; without `health` (gauges,), every finite gauge is good."""
         msg = self.message
         set_stamp(msg.header.stamp, sample.stamp_ns)
         msg.session, msg.sequence = sample.session, sample.sequence
@@ -371,12 +371,12 @@ def trajectory_name(raw):
 def trajectory_points(raw):
     """Number of points of a serialised `JointTrajectory`, without reading them.
 
-    `raw` is XCDR1 with its encapsulation header: the stamp, frame_id, joint_names, the points' number.
+    `raw` is XCDR1 with its encapsulation header: the stamp, frame_id, joint_names, the number of points.
 
     Raises
     ------
     struct.error, IndexError
-        When the bytes end before.
+        If the bytes end before this number.
     """
     unpack = struct.Struct("<I" if raw[1] & 1 else ">I").unpack_from
 

@@ -44,7 +44,7 @@ TRANSITIONS = {
 }
 NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 REPORT_EVERY = 10_000_000_000  # [ns]
-#: Work that the configuration waits for is in the log after the first of these times, then every second of them [s].
+#: Work for which the configuration waits is logged after the first of these times, then at intervals of the second [s].
 FIRST_NOTICE, NEXT_NOTICE = 0.5, 10.0
 
 ARM = parameter("arm", "", read_only=True).described(
@@ -60,8 +60,8 @@ COMMON = (AUTOSTART, *scheduling.PARAMETERS)
 class ArmNode(LifecycleNode):
     """A lifecycle node that is configured completely or not at all.
 
-    Subclasses implement `build` (parameters to objects, publishers, subscriptions), `start`, `stop` and
-    `diagnose`; what they create with the ``create_*`` methods is destroyed on clean-up.
+    Subclasses implement `build` (parameters to objects, publishers, subscriptions), `start`, `stop` and `diagnose`.
+    What they create with the ``create_*`` methods is destroyed on clean-up.
 
     Parameters
     ----------
@@ -108,15 +108,15 @@ class ArmNode(LifecycleNode):
     # Long work in `build` --------------------------------------------------------------------
 
     def wait_for(self, work, what):
-        """In `build`: what the function `work` returns, which takes long and is called in a thread of its own.
+        """For `build`: call the function `work`, which takes long, in a thread of its own, and return its result.
 
-        Meanwhile log and diagnostics state `what` the node does and for how long, and, where it starts by itself, its
+        Meanwhile log and diagnostics state `what` the node does and for how long. If the node starts by itself, its
         parameters and life cycle are served.
 
         Raises
         ------
         FlexarmError
-            When the process is to end; the thread goes on. Else what `work` raises.
+            If the process is to end; the thread goes on. Otherwise the errors of `work`.
         """
         future = _in_thread(work)
         began, notice, shown = time.monotonic(), FIRST_NOTICE, 0.0
@@ -138,8 +138,8 @@ class ArmNode(LifecycleNode):
 
     @contextmanager
     def _served(self):
-        """A function that waits a moment for a `Future`; it serves the node where nothing else does."""
-        if self.executor is not None:  # a transition that was asked for: its answer waits, too
+        """A function that waits a moment for a `Future`; it serves the node if nothing else does."""
+        if self.executor is not None:  # a requested transition: its answer waits, too
             yield lambda future: wait([future], 0.05)
             return
         executor = SingleThreadedExecutor(context=self.context)
@@ -155,8 +155,8 @@ class ArmNode(LifecycleNode):
     def make_publisher(self, kind, topic, profile=None, **kwargs):
         """A publisher that lives until clean-up; incompatible subscriptions are shown in diagnostics.
 
-        `topic` and message `kind`, and `kwargs`, are as in rclpy. A `profile` that is not given is that of the control
-        path, which the user may override.
+        `topic`, message `kind` and `kwargs` are as in rclpy. The default `profile` is that of the control path; the
+        user may override it.
         """
         return self._keep(self.destroy_publisher, self._publisher(kind, topic, profile, **kwargs))
 
@@ -206,7 +206,7 @@ class ArmNode(LifecycleNode):
     # Life cycle ------------------------------------------------------------------------------
 
     def on_configure(self, state):
-        """Build the node's objects from its parameters; without success the node stays unconfigured."""
+        """Build the node's objects from its parameters; if this fails, the node stays unconfigured."""
         if not self._tried("not configured", self.build):
             self._unmake()
             return TransitionCallbackReturn.FAILURE
@@ -214,12 +214,12 @@ class ArmNode(LifecycleNode):
         return super().on_configure(state)
 
     def on_activate(self, state):
-        """Let the node answer; where `start` fails it stays inactive."""
+        """Let the node answer; if `start` fails, it stays inactive."""
         self.active, self.control_path = True, self._control_path
         if not self._tried("not activated", self.start):
             self._halt()
             return TransitionCallbackReturn.FAILURE
-        # The objects made so far stay for good: the collector need not look at them on the control path.
+        # The objects made so far stay: the garbage collector need not visit them on the control path.
         gc.collect()
         gc.freeze()
         return super().on_activate(state)
@@ -247,19 +247,19 @@ class ArmNode(LifecycleNode):
         self.active, self.control_path = False, None
 
     def _tried(self, what, call, *args):
-        """Call; whether it did not raise. rclpy drops without a word what a transition raises."""
+        """Call, and return whether it did not raise; rclpy silently drops what a transition raises."""
         try:
             call(*args)
-        except Exception as error:  # of a user's law or device, say
+        except Exception as error:  # for example of a user's law or device
             known = isinstance(error, FlexarmError)
             self.failure = str(error) if known else traceback.format_exc()
             self.get_logger().error(f"{what}: {self.failure}")
             return False
         return True
 
-    # rclpy 7.1 of Jazzy lets the error of a wrong transition, activate while active say, end the process: issue 1209 of
-    # ros2/rclpy. Pull request 1319 fixed it in 8.0.0 (Kilted). The next two methods, of LifecycleNodeMixin by their
-    # names, can go when Jazzy does.
+    # rclpy 7.1 of Jazzy lets the error of a wrong transition, for example activate while active, end the process: issue
+    # 1209 of ros2/rclpy. Pull request 1319 fixed it in 8.0.0 (Kilted). The next two methods, of LifecycleNodeMixin by
+    # their names, can go when Jazzy does.
 
     def _LifecycleNodeMixin__change_state(self, transition_id):
         try:
@@ -274,7 +274,7 @@ class ArmNode(LifecycleNode):
         try:
             if label:
                 self._state_machine.get_transition_by_label(label)
-        except rclpy_implementation.RCLError:  # rclpy answers it without a word
+        except rclpy_implementation.RCLError:  # rclpy answers it silently
             self._refuse_transition(label)
             response.success = False
             return response
@@ -286,7 +286,7 @@ class ArmNode(LifecycleNode):
         self.get_logger().error(text)
 
     def autostart(self):
-        """Configure and activate; False when that failed."""
+        """Configure and activate; False if that failed."""
         if not self.parameters["autostart"]:
             return True
         for trigger in (self.trigger_configure, self.trigger_activate):
@@ -297,7 +297,7 @@ class ArmNode(LifecycleNode):
     # From other threads -------------------------------------------------------------------------
 
     def hand_over(self, callback, *args):
-        """From another thread: have the node's own thread call this between two samples, in the order handed over."""
+        """From another thread: let the node's own thread call this between two samples; calls keep their order."""
         self._handed.append((callback, args))
         # rclpy runs the newest task first: each task takes the oldest call.
         self.executor.create_task(self._take_over)
@@ -339,11 +339,11 @@ class ArmNode(LifecycleNode):
         return max(level, WARN), message, {**values, **shown}
 
     def report(self, text, info=False):
-        """Log a warning, or an information: a new text at once, one that differs only in numbers every ten seconds."""
+        """Log a warning or an information: a new text at once, one with only other numbers every ten seconds."""
         kind = NUMBER.sub("#", text)
         now = self._steady.now().nanoseconds
         if now - self._reported.get(kind, -REPORT_EVERY) >= REPORT_EVERY:
-            if len(self._reported) > 100:  # a message may hold any names
+            if len(self._reported) > 100:  # a message may contain any names
                 self._reported.clear()
             self._reported[kind] = now
             if info:
@@ -353,7 +353,7 @@ class ArmNode(LifecycleNode):
 
 
 def _in_thread(work):
-    """The `Future` of a function that is called in a thread, which does not keep the process from ending."""
+    """The `Future` of a function that is called in a thread; the thread does not keep the process from ending."""
     future = Future()
 
     def call():
@@ -367,19 +367,19 @@ def _in_thread(work):
 
 
 def run(node_class, args=None):
-    """Run a node, or several in one process, until SIGINT or SIGTERM; the process's exit code.
+    """Run a node, or several in one process, until SIGINT or SIGTERM; return the exit code of the process.
 
     Parameters
     ----------
     node_class : callable
-        Makes the node, or a list of nodes: the order in which they are configured and activated.
+        Makes the node, or a list of nodes in the order in which they are configured and activated.
     args : list of str, optional
         Command line.
 
     Returns
     -------
     int
-        0 after a signal, 1 when the node could not start.
+        0 after a signal, 1 if the node could not start.
     """
     stopped = []
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -388,7 +388,7 @@ def run(node_class, args=None):
     try:
         try:
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        except RuntimeError as error:  # what rcl says of a command line or parameter file
+        except RuntimeError as error:  # rcl's error about a command line or parameter file
             print(f"{node_class.__name__}: {error}", file=sys.stderr)
             return 1
         made = node_class()

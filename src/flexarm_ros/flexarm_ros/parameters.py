@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Declared parameters as ROS parameters: descriptors, validation, and what changed."""
+"""Makes declared parameters ROS parameters: descriptors, validation, and what changed."""
 
 import difflib
 
@@ -35,7 +35,7 @@ def descriptor(parameter):
         description=text,
         additional_constraints="; ".join(limits),
         read_only=parameter.read_only,
-        # Our own check looks at the type: its refusal says what to write instead.
+        # Our own check looks at the type: its error message states what to write instead.
         dynamic_typing=True,
     )
     if parameter.low is not None and parameter.high is not None:
@@ -50,7 +50,7 @@ def descriptor(parameter):
 
 
 def _give_empty_list(node, name, parameter):
-    """A parameter file's ``[]`` has no type for ROS, which hands it on as None; `ros2 param dump` writes it."""
+    """Replace None: ROS hands on a parameter file's ``[]``, which has no type, as None; `ros2 param dump` writes it."""
     given = node._parameter_overrides.get(name)
     if given is not None and given.value is None and parameter.kind.endswith("array"):
         node._parameter_overrides[name] = Parameter(name, value=[])
@@ -68,13 +68,13 @@ class NodeParameters:
     Raises
     ------
     ParameterError
-        When a value given at the start can't be used.
+        If a value given at the start can't be used.
 
     Attributes
     ----------
     given : set of str
-        Full names of the parameters that the user has set, at the start or later; of a file for all nodes also those
-        that this one has not.
+        Full names of the parameters that the user has set, at the start or later. A file for all nodes adds also names
+        that this node does not have.
     """
 
     def __init__(self, node, groups):
@@ -89,7 +89,7 @@ class NodeParameters:
             try:
                 node.declare_parameter(name, parameter.default, descriptor(parameter))
             except InvalidParameterValueException as error:
-                # A scalar out of range: our own check says it with the unit.
+                # A scalar out of range: our own check reports it with the unit.
                 parameter.check(node._parameter_overrides[name].value, prefix=prefix)
                 raise ParameterError(f"{name}: {error}") from None
         self.given = set(node._parameter_overrides)
@@ -99,9 +99,9 @@ class NodeParameters:
         node.add_post_set_parameters_callback(self._on_applied)
 
     def _warn_unknown(self):
-        """A misspelt name in a parameter file is ignored by ROS; so the node warns.
+        """Warn of a misspelt name in a parameter file, which ROS ignores.
 
-        One file may serve all nodes, so that only names like one of this node's are worth a word.
+        One file may serve all nodes, so warn only of names that are similar to one of this node's.
         """
         known = set(self._declared) | set(self._node._parameters)
         for name in self._node._parameter_overrides:
@@ -112,9 +112,9 @@ class NodeParameters:
                 )
 
     def resolve(self, sizes):
-        """Check again, with the lengths that are known once the arm is loaded.
+        """Check again, with the lengths that are known when the arm is loaded.
 
-        `sizes` maps the names that declarations give as lengths, ``joints`` say, to numbers.
+        `sizes` maps the names that declarations use as lengths, for example ``joints``, to numbers.
 
         Raises
         ------
@@ -146,7 +146,7 @@ class NodeParameters:
         self._listener = listener
 
     def judged_by(self, judge):
-        """Call ``judge(all values by full names)`` before a set is taken; a `FlexarmError` of it refuses the set."""
+        """Call ``judge(all values by full names)`` before a set is taken; its `FlexarmError` refuses the set."""
         self._judge = judge
 
     def __getitem__(self, name):
@@ -157,7 +157,7 @@ class NodeParameters:
         return dict(self._values)
 
     def group(self, prefix, declared=None):
-        """Values under a prefix, without it; only those of the parameters `declared`, where given."""
+        """Values under a prefix, by names without it; only those of the parameters `declared`, if given."""
         names = None if declared is None else {p.name for p in declared}
         return {
             p.name: self._values[full]
@@ -170,7 +170,7 @@ class NodeParameters:
         return {name: self._node.get_parameter(name).value for name in self._declared}
 
     def _checked(self, given):
-        """Those of `given` values by full names that are declared here, checked; the others can't have changed."""
+        """The `given` values, by full names, of parameters declared here, checked; the others can't have changed."""
         values = {}
         for name, value in given.items():
             if name in self._declared:
@@ -181,7 +181,7 @@ class NodeParameters:
         return values
 
     def _on_set(self, parameters):
-        # Validates only: nothing is applied here, so that a refused set leaves no trace.
+        # Only validate: nothing is applied here, so a refused set changes nothing.
         try:
             changed = self._checked({p.name: p.value for p in parameters})
             if changed and self._judge is not None:

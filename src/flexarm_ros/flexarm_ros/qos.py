@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service on the control path: reliable, volatile, the newest sample only; overridable by parameters.
+"""Sets the quality of service on the control path: reliable, volatile, newest sample only; parameters override it.
 
 A publisher and a subscription with incompatible policies exchange nothing, without an error: `Mismatches` reports them.
 """
@@ -42,19 +42,20 @@ OVERRIDABLE = (
     QoSPolicyKind.RELIABILITY,
     QoSPolicyKind.DURABILITY,
 )
-#: Policies of which a publisher may offer less than a subscription asks for: the lesser value, the greater one.
+#: Policies of which a publisher may offer less than a subscription requests: (lower value, higher value).
 VALUES = {"reliability": ("best_effort", "reliable"), "durability": ("volatile", "transient_local")}
 
 
 def overridable():
-    """Lets a user change the policies by ``qos_overrides.<topic>.<publisher|subscription>.…``."""
+    """Let a user change the policies by ``qos_overrides.<topic>.<publisher|subscription>.…``."""
     return QoSOverridingOptions(OVERRIDABLE)
 
 
 def made(create, topic, profile):
     """Call ``create(profile)`` for a publisher or subscription of `topic` with a profile of its own.
 
-    rclpy writes overrides into the profile that it is given: of a shared one, other topics would get them too.
+    rclpy writes overrides into the profile that it is given; if topics shared a profile, the others would get them,
+    too.
 
     Raises
     ------
@@ -137,7 +138,7 @@ class Mismatches:
             self._node.get_logger().warning(text)
 
     def forget(self, ends):
-        """These publishers and subscriptions are destroyed."""
+        """Forget publishers and subscriptions that are destroyed."""
         gone = {id(end) for end in ends}
         self._found = {k: m for k, m in self._found.items() if id(m.end) not in gone}
 
@@ -147,7 +148,7 @@ class Mismatches:
         return {topic: m.text for (topic, _, _), m in self._found.items()}
 
     def _lasts(self, mismatch):
-        """Whether an incompatible other end still exists; one that is not discovered yet counts."""
+        """Whether an incompatible other end still exists; an end that is not discovered yet counts."""
         node, end = self._node, mismatch.end
         look = (
             node.get_subscriptions_info_by_topic

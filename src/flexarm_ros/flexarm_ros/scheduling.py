@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where and how urgently a node's process runs: CPU affinity and real-time priority; Linux.
+"""Sets where and how urgently a node's process runs: CPU affinity and real-time priority (Linux).
 
-Both are off by default. They apply to every thread that the process has when its node is made, the middleware's
-among them: a message waits for the slowest of them. Threads made later, in which laws are designed, stay on those
-CPUs but have ordinary priority, so that a design never holds up a sample.
+Both are off by default. They apply to every thread that the process has when its node is made, also to those of the
+middleware: a message waits for the slowest of them. Threads made later, in which laws are designed, stay on those CPUs
+but have ordinary priority, so a design never delays a sample.
 """
 
 import os
@@ -37,16 +37,16 @@ def threads():
 
 
 def apply(cpus, priority, warn):
-    """Take the values of `PARAMETERS`.
+    """Apply the values of `PARAMETERS`.
 
     Parameters
     ----------
     cpus : sequence of int
-        Empty: whatever the process was started with.
+        Empty: those with which the process was started.
     priority : int
-        0: whatever the process was started with.
+        0: the priority with which the process was started.
     warn : callable
-        Takes a sentence, where the system refuses the priority: the node then runs without it.
+        Called with a sentence if the system refuses the priority; the node then runs without it.
 
     Raises
     ------

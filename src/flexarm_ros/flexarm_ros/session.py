@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program's session beside running nodes: it collects topics, publishes, calls services and waits.
+"""Gives a program a session beside running nodes: it collects topics, publishes, calls services and waits.
 
 The commands and the tests' harness use this one class. Every wait is bounded: it ends when its condition holds, when
 its time is over, or at once when one of the watched processes has died.
@@ -18,7 +18,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 from . import qos
 
-#: Loses no message of a reader that falls behind for seconds.
+#: Loses no message even if a reader falls behind for seconds.
 DEEP = QoSProfile(
     history=QoSHistoryPolicy.KEEP_LAST, depth=20_000, reliability=QoSReliabilityPolicy.RELIABLE
 )
@@ -29,7 +29,7 @@ LOOKING_ON = QoSProfile(
 
 
 class WaitError(FlexarmError):
-    """Something that was waited for did not happen in time."""
+    """An expected event did not happen in time."""
 
 
 class Unserved(CallbackGroup):
@@ -47,14 +47,14 @@ class Unserved(CallbackGroup):
         """Nothing to do."""
 
 
-#: Longest that `taken` goes on [s]: messages that arrive as fast as they are read would hold it for ever.
+#: Max. duration of `taken` [s]; otherwise it would not end if messages arrive as fast as they are read.
 MAX_TAKE = 0.1
 
 
 def taken(subscription, raw=False):
     """Yield the messages that wait in a subscription's queue; serialised ones if `raw`.
 
-    It ends after `MAX_TAKE`, and the next call goes on with what is left.
+    It ends after `MAX_TAKE`; the next call continues with the rest.
     """
     handle, kind = subscription.handle, subscription.msg_type
     end = time.monotonic() + MAX_TAKE
@@ -131,7 +131,7 @@ class Latest:
         )
 
     def take(self):
-        """The newest message since the last call; None without one."""
+        """The newest message since the last call; None if there is none."""
         newest = None
         for newest in taken(self._subscription, self._raw):  # noqa: B007
             pass
@@ -162,7 +162,7 @@ class Question:
         self.answer = None
 
     def poll(self):
-        """Send the request if it is due; whether the answer has arrived."""
+        """Send the request if it is due; return whether the answer has arrived."""
         if self.answer is None:
             self.answer = next((f.result() for f in self._futures if f.done()), None)
             if self.answer is not None:
@@ -193,9 +193,9 @@ class Session:
         Watched while waiting: ``check()`` raises a `FlexarmError` for a process that has died, ``tails()`` is the
         end of each log.
     patience : float
-        Timeout of a wait that names none [s].
+        Default timeout of a wait [s].
     period : float
-        Time between two looks at the taps and at the condition that is waited for [s].
+        Time between two checks of the taps and of the awaited condition [s].
 
     Attributes
     ----------
@@ -239,7 +239,7 @@ class Session:
         Parameters
         ----------
         what : str
-            What is waited for, for the error.
+            What is awaited, for the error.
         condition : callable
         patience : float, optional
             [s]
@@ -251,7 +251,7 @@ class Session:
         WaitError
             After `patience`, with the end of the watched processes' logs.
         FlexarmError
-            At once, when a watched process has died.
+            At once, if a watched process has died.
         """
         patience = self.patience if patience is None else patience
         if value := self.serve(patience, condition):
@@ -266,7 +266,7 @@ class Session:
         Raises
         ------
         FlexarmError
-            When a watched process has died, unless its end is what the condition waits for.
+            If a watched process has died, unless the condition waits for its end.
         """
         end = time.monotonic() + seconds
         while True:
@@ -287,10 +287,10 @@ class Session:
             self.executor.spin_once(timeout_sec=min(self.period, left))
 
     def poll(self):
-        """Take what has arrived on the taps, and attend to requests; serves no callbacks."""
+        """Take what has arrived on the taps, and handle requests; callbacks are not served."""
         for tap in self._taps.values():
             tap.poll()
-        # An answer's callback may ask the next question.
+        # The callback of an answer may ask the next question.
         for question in list(self._questions):
             if question.poll():
                 self._questions.remove(question)
@@ -315,7 +315,8 @@ class Session:
     def publisher(self, kind, topic, readers=0, profile=qos.COMMAND):
         """The publisher of a topic, once `readers` subscriptions have discovered it.
 
-        `kind` is the type of the messages; without a profile it is reliable and volatile, as ``ros2 topic pub``'s.
+        `kind` is the type of the messages; the default profile is reliable and volatile, like that of ``ros2 topic
+        pub``.
         """
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(kind, topic, profile)
@@ -328,7 +329,7 @@ class Session:
     # Services --------------------------------------------------------------------------------
 
     def ask(self, kind, service, /, then=None, **request):
-        """Send a request of a `kind` to a `service` without waiting; its `Question`.
+        """Send a request of a `kind` to a `service` without waiting; return its `Question`.
 
         While serving, ``then(answer)`` is called.
         """

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spins nodes whose control path is one subscription, without rebuilding a wait set of everything per message.
 
-rclpy's executor gathers every service, timer and event of a node anew for each message: for a lifecycle node
-that costs more than the control law. Here the control path waits on its own subscription alone, and the
-executor serves the rest (parameters, services, timers, trajectories) every `HOUSEKEEPING` seconds, if there is any to
-serve: `Others` finds that out in a sixth of the executor's time. It takes what ``rclpy.wait_for_message`` takes of
-rclpy: a wait set.
+rclpy's executor gathers every service, timer and event of a node anew for each message. For a lifecycle node that costs
+more than the control law. Here the control path waits for its own subscription alone. The executor serves the rest
+(parameters, services, timers, trajectories) every `HOUSEKEEPING` seconds, if there is anything to serve: `Others` finds
+that out in a sixth of the executor's time. It uses the same part of rclpy as ``rclpy.wait_for_message``: a wait set.
 """
 
 import inspect
@@ -19,9 +18,9 @@ from rclpy.waitable import NumberOfEntities
 
 #: Services, timers and slow topics are served at least this often [s].
 HOUSEKEEPING = 0.02
-#: How many of them are served in one turn for each node; looking for each costs about 0.2 ms.
+#: How many of them are served in one turn for each node; the search for each costs about 0.2 ms.
 AT_ONCE = 2
-#: Every so many turns the executor looks itself.
+#: After this many turns the executor itself searches.
 EVERY = 25
 
 
@@ -31,11 +30,11 @@ class ControlPath:
     Parameters
     ----------
     subscription : rclpy.subscription.Subscription
-        Its callback is called by the executor as well, whichever comes first.
+        The executor calls its callback as well, if it comes first.
     period : float, optional
-        A callback in real time is wanted every so many seconds (steady clock).
+        Time between two calls of `on_period`, in seconds of the steady clock.
     on_period : callable, optional
-        That callback. A period that was missed whole is not made up for.
+        A callback in real time. It is not called later for a period that was missed completely.
 
     Attributes
     ----------
@@ -50,21 +49,21 @@ class ControlPath:
 
 
 class _Executor(SingleThreadedExecutor):
-    """rclpy's executor, which tells whether tasks were given to it that are not done."""
+    """rclpy's executor, which also knows whether it was given tasks that are not done."""
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
         self._given = deque()
 
     def create_task(self, callback, *args, **kwargs):
-        """As rclpy's; from any thread."""
+        """As in rclpy; from any thread."""
         task = super().create_task(callback, *args, **kwargs)
         self._given.append(task)
         return task
 
     @property
     def has_tasks(self):
-        """Whether one of them is not done."""
+        """Whether a task is not done."""
         given = self._given
         while given and (given[0].done() or given[0].cancelled()):
             given.popleft()
@@ -86,7 +85,7 @@ class Others:
         self._turn = 0
 
     def waiting(self):
-        """Whether there is something to serve; in doubt, which is every `EVERY` turns, true."""
+        """Whether there is something to serve; also true every `EVERY` turns, for what this check may miss."""
         self._turn = (self._turn + 1) % EVERY
         if self._turn == 0 or self._executor.has_tasks:
             return True
@@ -109,7 +108,7 @@ class Others:
             return False
 
     def waits(self, node):
-        """Whether a timer, message, request, answer or event of a `node` waits, those of the control path aside."""
+        """Whether a timer, message, request, answer or event of a `node` waits, except those of the control path."""
         if any(timer.is_ready() for timer in node.timers):
             return True
         subscriptions = [
@@ -192,7 +191,7 @@ def _spin_control_path(node, path, executor, nodes, stopped):
             others = now + HOUSEKEEPING
         if due is not None and now >= due:
             path.on_period()
-            # On the grid of whole periods: a late one is followed by a short one, one missed whole is lost.
+            # On the grid of whole periods: a short period follows a late one, and a period missed completely is lost.
             due += path.period
             missed = int((clock() - due) / path.period)
             if missed > 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts and ends a node's process: a signal ends it cleanly from the first moment, while it still imports."""
+"""Starts and ends a node's process: from the first moment, even during imports, a signal ends it cleanly."""
 
 import contextlib
 import ctypes
@@ -12,23 +12,24 @@ import sys
 
 from flexarm_dynamics.processes import ONE_THREAD
 
-#: Names the process that this one is to end with, in the environment; see `end_with_parent`.
+#: Environment variable that names the process with which this one is to end; see `end_with_parent`.
 PARENT = "FLEXARM_PARENT"
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 
 
 def end_with_parent():
-    """Have the system send SIGTERM when the process that started this one is gone, however it ended; Linux.
+    """Let the system send SIGTERM when the process that started this one has ended for any reason (Linux).
 
-    Only where the environment names it, so that what a person starts by hand survives its shell. The request is
-    made by the child and not between fork and exec: Python may not run there beside the middleware's threads.
+    This is done only if the environment names that process, so a process started by hand survives its shell. The child
+    makes the request, and not the parent between fork and exec: Python may not run there beside the middleware's
+    threads.
     """
     parent = os.environ.pop(PARENT, "")  # not for children of this process
     if not parent.isdigit() or not sys.platform.startswith("linux"):
         return
     if os.getppid() == int(parent):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-    # Gone already, and this process adopted by another: the signal would never come.
+    # The parent is gone already, and another process has adopted this one: the signal would never come.
     if os.getppid() != int(parent) and not os.path.exists(f"/proc/{parent}"):
         os._exit(0)
 
@@ -37,7 +38,7 @@ def start(module):
     """Import a node's module and call its `main`; linear algebra has one thread, here and in processes it starts."""
     for name in ONE_THREAD:
         os.environ.setdefault(name, "1")
-    faulthandler.enable()  # a crash in the middleware says where
+    faulthandler.enable()  # shows where the middleware crashes
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
     end_with_parent()
@@ -47,10 +48,10 @@ def start(module):
 def leave(code):
     """End this process, whose nodes are destroyed and whose contexts are shut down, with an exit code.
 
-    Without the destructors of the middleware's libraries: under load Fast DDS was seen to corrupt its heap or
-    to hang in them, some three times in a thousand exits, after the interpreter had finished.
+    The destructors of the middleware's libraries are not run. Under load, some three exits in a thousand, Fast DDS
+    corrupted its heap or hung in them after the interpreter had finished.
     """
-    # What still refers to a context goes now: with it the participant, and what that has in shared memory.
+    # Delete what still refers to a context: this also deletes the participant and its shared memory.
     gc.unfreeze()
     gc.collect()
     if "rclpy" in sys.modules:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node measures of itself for `/diagnostics`: cheap per sample, worked out once a second.
+"""Measures a node's own work for `/diagnostics`: cheap for each sample, evaluated once a second.
 
 `Percentiles` and `Gaps` are fed on the control path: no allocation there beyond Python's own small numbers, no
-sorting, no clock. Percentiles are by nearest rank: the smallest value that at least so many per cent do not
-exceed, so that each is a value that was seen.
+sorting, no clock. Percentiles are by nearest rank: the smallest value that at least the given per cent of values do not
+exceed. So each is a value that occurred.
 """
 
 import math
@@ -20,7 +20,7 @@ class Percentiles:
     Parameters
     ----------
     capacity : int
-        So many of the newest values are kept; the largest is of all.
+        Number of the newest values that are kept; the largest value is that of all values.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Percentiles:
         Returns
         -------
         tuple of float
-            One for each of `percents`, then the largest; all NaN when nothing was added.
+            One for each of `percents`, then the largest; all NaN if nothing was added.
         """
         kept = min(self.count, self._ring.size)
         if not kept:
@@ -80,7 +80,7 @@ class Latency:
         self.add = self._times.add
 
     def values(self):
-        """Name to text, of the times since the last call; a dash where there were none."""
+        """Texts by name, of the times since the last call; a dash if there were none."""
         p50, p99, largest = self._times.take(50.0, 99.0)
         named = {"p50": p50, "p99": p99, "max": largest}
         return {
@@ -98,7 +98,7 @@ class Gaps:
         Since the start.
     """
 
-    #: A number further off than this is no gap: the source counts anew.
+    #: A difference larger than this is not a gap: the source counts anew.
     FAR = 100_000
 
     def __init__(self):
@@ -108,7 +108,7 @@ class Gaps:
     def add(self, session, sequence):
         """Note the number of one sample.
 
-        A new session begins anew; a sample that was sent again, or comes late, takes nothing back.
+        A new session begins anew. A sample that was sent again, or comes late, does not reduce the count.
 
         `sequence` is the sample's number in its `session`.
         """

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rules of `joint_torque`: which torque a driver may apply, and when it takes the safe action.
+"""Decides which `joint_torque` a driver may apply, and when it takes the safe action.
 
-A torque acts while it answers a state of this session that was published for the first time no longer than the timeout
-ago, and that names the torque's controller. Otherwise the joints take their safe action: before the first such torque,
-without a fresh one, on DISABLED, after a message that can't be used, and while two controllers send.
+A torque acts while it answers a state of this session that names the torque's controller, and whose first publication
+is not longer ago than the timeout. Otherwise the joints take their safe action: before the first such torque, without a
+fresh torque, on DISABLED, after a message that can't be used, and while two controllers send.
 """
 
 import numpy as np
@@ -17,14 +17,14 @@ WRAP = 2**32
 
 
 class Controllers:
-    """Notices a second controller: an id that comes back after another one, or two answers where one is due.
+    """Detects a second controller: an id that comes back after another one, or two answers where one is due.
 
     A controller that was restarted has a new id and is accepted at once.
 
     Parameters
     ----------
     alone : float
-        After two have sent, one must be silent for this long; in the unit of the times given [s].
+        After two have sent, one must be silent for this long; in the unit of the given times [s].
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Controllers:
         self._dispute(now, self.RACED)
 
     def withdraw(self, now):
-        """Note DISABLED after a torque for the same state: once it is a controller's stop, twice they are two."""
+        """Note DISABLED after a torque for the same state: once is a controller's stop, twice are two controllers."""
         if now - self._withdrawn < self.alone:
             self.race(now)
         self._withdrawn = now
@@ -79,7 +79,7 @@ class Controllers:
         return now < self._until
 
     def doubt(self, now):
-        """Why it is unknown whose torque is the right one; empty where it is known."""
+        """Why it is unknown which controller's torque is the right one; empty if it is known."""
         return self._reason if self.several(now) else ""
 
 
@@ -110,9 +110,9 @@ class TorqueLimit:
 class TorqueGate:
     """Lets one controller's fresh torque through, clipped to the joints' limits.
 
-    A controller claims the arm by answering a state. From then on the states name it, and its answers to *those* act: a
-    stranger has to listen, and to race the controller, which is noticed. The claim ends when no answer has come for the
-    timeout, with a message that can't be used, and with another controller's message.
+    A controller claims the arm by answering a state. From then on the states name it, and its answers to *those* act.
+    So another program would have to read the states and to race the controller, which is detected. The claim ends when
+    no answer has come for the timeout, with a message that can't be used, and with a message of another controller.
 
     It has no clock: the caller gives all times, in seconds of one steady clock. It is not thread-safe: a driver
     that reads its device in another thread holds a lock around each call.
@@ -122,7 +122,7 @@ class TorqueGate:
     arm : Arm
         Its joint names and torque limits apply.
     timeout : float
-        A torque is too late when it answers a state that was first published longer ago than this [s].
+        A torque is too late if it answers a state that was first published longer ago than this [s].
     alone : float
         After two controllers have sent, one must be silent for this long [s].
 
@@ -158,7 +158,7 @@ class TorqueGate:
         return self._limit.clipped
 
     def begin(self, session):
-        """Begin a new session of the source: earlier messages answer nothing any more."""
+        """Begin a new session of the source: earlier messages no longer answer any state."""
         self.session = session
         self._sent = {}  # sequence -> (time of its first publication, controller that it names), oldest first
         self._newest = self._answered = None
@@ -169,13 +169,13 @@ class TorqueGate:
         self.reason = "no torque yet"
 
     def controller_id(self, now):
-        """Id of the controller whose answer to a state that is published now will act; 0: of none."""
+        """Id of the controller whose answer to a state that is published now will act; 0: no controller."""
         return self._claimant if self._fresh_until >= now else 0
 
     def sent(self, sequence, now):
-        """Note that the state `sequence` is published now; the `controller_id` that it has to name.
+        """Note that the state `sequence` is published now; return the `controller_id` that it has to name.
 
-        A state that is published again keeps its first time: a repeat is no sign of life.
+        A state that is published again keeps its first time: a repetition is not a sign of life.
         """
         named = self.controller_id(now)
         if sequence in self._sent:
@@ -187,14 +187,14 @@ class TorqueGate:
         return named
 
     def offer(self, message, now):
-        """Accept a `JointTorque` message, or say why not.
+        """Accept a `JointTorque` message, or return why it is refused.
 
         `now` is the driver's own steady clock [s].
 
         Returns
         -------
         str
-            Why it is not applied; empty where it is.
+            Why it is not applied; empty if it is.
         """
         sequence, controller = message.sequence, message.controller_id
         if message.session != self.session:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many arms side by side, on all cores: different initial states, torques or arms; arrays in and out."""
+"""Simulates many arms side by side on all cores, with different initial states, torques or arms; arrays in and out."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -30,7 +30,7 @@ class Arms:
     method : str
         One of `integrators.METHODS`.
     workers : int, optional
-        Number of threads; default: that of the cores. The compiled loops release the interpreter's lock.
+        Number of threads; default: the number of cores. The compiled loops release the interpreter's lock.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Arms:
         self.step, self.substeps = step, substeps
         tableau, count = integrators.METHODS[method], len(self.models)
         workers = min(workers or os.cpu_count() or 1, count) or 1
-        # Interleaved, the parts cost the same whatever the order of the arms; each thread has steppers of its own.
+        # Interleaved parts cost the same whatever the order of the arms. Each thread has steppers of its own.
         self._parts = []
         for k in range(workers):
             steppers = {id(m): m.stepper(tableau) for m in self.models[k::workers]}
@@ -69,7 +69,7 @@ class Arms:
         Parameters
         ----------
         torque : ndarray, shape (n,) or (b, n)
-            Constant meanwhile [N m].
+            Constant during the interval [N m].
 
         Returns
         -------
@@ -105,7 +105,7 @@ class Arms:
         Returns
         -------
         ndarray, shape (b, s + 1, 2 (n + m))
-            From the present states on; the last ones are the present ones then.
+            States from the present ones on; the last ones become the present ones.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class Arms:
         return out
 
     def _run(self, work):
-        """Call with the arms of each thread."""
+        """Call `work` with the arms of each thread."""
         if len(self._parts) == 1:
             work(self._parts[0])
         else:
@@ -195,5 +195,5 @@ def _check(models, size):
 
 
 def _built(given):
-    """A model as it is, and that of an `Arm` at the level that its loads need."""
+    """A given model as it is, or the model of an `Arm` at the level that its loads need."""
     return model.build(levels.simulated(given)) if isinstance(given, Arm) else given

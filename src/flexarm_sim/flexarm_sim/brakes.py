@@ -12,8 +12,8 @@ their brakes, and H that of (3) for those joints. The brakes' torques :math:`\la
 They minimise :math:`\tfrac12\lambda^TH\lambda + a^T\lambda` over a box (Gauss's least constraint); H is positive
 definite, and principal pivoting by the least index finds them (Murty 1974, Math. Program. 7, 367-370).
 
-Joints that stick are locked: they are taken out of the equations of motion, so that they rest to the last bit. A step
-in which a joint stops is divided there.
+Joints that stick are locked: they are taken out of the equations of motion, so they rest to the last bit. A step in
+which a joint stops is divided there.
 """
 
 import math
@@ -42,7 +42,7 @@ def pivot(acceleration, response):
     Parameters
     ----------
     acceleration : ndarray, shape (k,)
-        Without the brakes [rad/s^2].
+        Accelerations without the brakes [rad/s^2].
     response : ndarray, shape (k, k)
         What the full torque of each brake adds to it, by columns [rad/s^2].
 

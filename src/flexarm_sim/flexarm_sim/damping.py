@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The safe action `damp`: how large the torque against a joint's velocity becomes, and how softly it begins.
+r"""Computes the safe action `damp`: how large the torque against a joint's velocity becomes, and how softly it begins.
 
 A drive without fresh torque takes its velocity loop to zero, :math:`-T(t)\tanh(\dot q/v_0)` with :math:`v_0` =
-`DAMP_SPEED`. A torque T decelerates a joint of inertia J by a = T/J. From a speed v it stops on the way
+`DAMP_SPEED`. A torque T decelerates a joint of inertia J by a = T/J. From a speed v it stops within the distance
 
 .. math:: s \approx \tfrac12 v\,t_d + \frac{v^2}{2a},
 
-and bends the links as this acceleration does, or twice as far where it comes at once. The whole torque limit bends
-arm R seven times as far as the move that it ends. Therefore, for each joint:
+and bends the links as this acceleration does, or twice as far if it comes at once. The whole torque limit bends arm R
+seven times as far as the move that it ends. Therefore, for each joint:
 
 - T is what stops it within `WAY`, :math:`Jv^2/(2\,\mathrm{WAY})`, with its largest speed v since the safe action
   began. So a fast motion is stopped with more torque than a slow one, in proportion to its own: a move over 1 rad
   from rest to rest accelerates as much. T is at least `FRACTION` of, and at most, what the arm allows: the torque
-  limit, and the torque that strains a gauge, by accelerating the rigid arm, to `OF_RANGE` of its full scale. What
-  the arm's weight asks of the joint in any pose is added, within the torque limit. `damp_torque` in the arm file
-  replaces all of this.
+  limit, and the torque that strains a gauge, by accelerating the rigid arm, to `OF_RANGE` of its full scale. The
+  largest torque that bears the arm's weight in any pose is added, within the torque limit. `damp_torque` in the arm
+  file replaces all of this.
 - It grows linearly within :math:`t_d`, half a period of the lowest bending mode with locked joints but at most
-  `MAX_TIME`; `damp_time` in the arm file replaces it. The part that bears the weight acts at once, so that the arm
-  does not drop.
+  `MAX_TIME`; `damp_time` in the arm file replaces it. The part that bears the weight acts at once, so the arm does not
+  drop.
 
 With a `damp_coefficient` c in the arm file the torque is :math:`-c\,\dot q` without a bound, with the same soft
 start. An arm without torque limit and gauges has the same, with c = `DAMP_RATE` times its inertia. Under gravity
@@ -33,13 +33,13 @@ from flexarm_dynamics.singular_perturbation import quasi_steady_state, slow_torq
 DAMP_SPEED = 0.05
 #: Where nothing bounds the torque, the rigid arm is stopped at this rate [1/s].
 DAMP_RATE = 10.0
-#: On which a joint is stopped, but for the soft start [rad].
+#: Distance within which a joint is stopped, without the soft start [rad].
 WAY = 0.35
-#: Least torque, as a fraction of what the arm allows; fraction of the gauges' full scale that it allows [-].
+#: Minimum torque, as a fraction of what the arm allows; fraction of the gauges' full scale that it allows [-].
 FRACTION, OF_RANGE = 0.2, 0.5
 #: Longest soft start that is chosen here [s].
 MAX_TIME = 0.25
-#: Poses in which the weight is looked for.
+#: Number of poses in which the weight is evaluated.
 POSES = 64
 
 
@@ -59,7 +59,7 @@ class Damping:
     time : ndarray, shape (n,)
         t_d [s].
     elapsed : float
-        How far the soft start is [s]; while a torque acts it goes back as fast as it came.
+        Progress of the soft start [s]; while a torque acts, it decreases as fast as it grew.
     speed : ndarray, shape (n,)
         Each joint's largest since the safe action began [rad/s].
     """
@@ -87,7 +87,7 @@ class Damping:
         self.begin()
 
     def begin(self):
-        """Forget what was: the next safe action begins softly."""
+        """Forget the past: the next safe action begins softly."""
         self.elapsed = 0.0
         self.speed[:] = 0.0
 
@@ -97,7 +97,7 @@ class Damping:
         np.maximum(self.speed, np.abs(velocity), out=self.speed)
 
     def release(self, time):
-        """Note that a torque acts for a `time` [s]; one that comes now and then must not keep `damp` soft for ever."""
+        """Note that a torque acts for a `time` [s]; rare torques must not keep `damp` soft for ever."""
         self.elapsed = max(0.0, self.elapsed - time)
         if not self.elapsed:
             self.speed[:] = 0.0

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Arms as a vector environment of gymnasium: each learns to reach a joint configuration, and to swing there no more.
+r"""A vector environment of gymnasium whose arms each learn to reach a joint configuration without swinging there.
 
-The state of each arm is observed in full, q, delta, qd, delta_d, and after it the way that is left, g - q for the goal
-g. An action is the joints' torques over their limits. The reward of a step is
+The observation of each arm is its full state, q, delta, qd, delta_d, and then the way that is left, g - q for the goal
+g. An action is the joints' torques divided by their limits. The reward of a step is
 
 .. math:: -\sum_i|g_i - q_i| - |w|/L,
 
-with the tip's deflection w over the arm's reach L. An episode is terminated where the arm leaves what its model holds
-for, with the penalty `LOST`, and truncated after its time. The next step of that arm then begins a new one, whatever
-its action (`AutoresetMode.NEXT_STEP`). Give functions of your own for other rewards and goals.
+with the tip's deflection w over the arm's reach L. An episode is terminated, with the penalty `LOST`, if the arm leaves
+the range of its model so far that its state is not finite. It is truncated after its time. The next step of that arm
+then begins a new episode, whatever the action (`AutoresetMode.NEXT_STEP`). Give a `reward` function of your own for
+other rewards and goals.
 
 gymnasium is optional: ``pip install gymnasium``, or the wheel's extra ``gym``.
 """
@@ -40,9 +41,9 @@ class ArmVectorEnv(object if gymnasium is None else gymnasium.vector.VectorEnv):
     period : float
         Time between two actions [s].
     duration : float
-        Of an episode [s].
+        Duration of an episode [s].
     reach : float
-        Begin and goal of each joint are uniform within its range, and this from zero [rad].
+        Start and goal of each joint are uniform within its range, and at most this far from zero [rad].
     reward : callable, optional
         ``reward(states, goals, torque)``, of (b, 2 (n + m)), (b, n) and (b, n): (b,).
     method : str
@@ -134,7 +135,7 @@ class ArmVectorEnv(object if gymnasium is None else gymnasium.vector.VectorEnv):
         self.arms.close()
 
     def _begin(self, which):
-        """Put arms, a mask, at rest somewhere, bent by their weight, and give them goals."""
+        """Put the arms of a mask at rest in random poses, bent by their weight, and give them goals."""
         places = np.flatnonzero(which)
         begin, goals = self.np_random.uniform(self._low, self._high, (2, places.size, self._n))
         self.goals[places], self._ages[places] = goals, 0
@@ -157,7 +158,7 @@ class ArmVectorEnv(object if gymnasium is None else gymnasium.vector.VectorEnv):
 
 
 def _tip_deflection(arm_model):
-    """What the modes deflect the last link's tip by, (2, m)."""
+    """Deflection of the last link's tip by each mode, (2, m)."""
     return (
         np.array([arm_model.tip_deflection(unit) for unit in np.eye(arm_model.n_modes)])
         .reshape(-1, 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults in what the simulator publishes, to test how observer and controller respond to them.
+"""Puts faults into what the simulator publishes, to test how observer and controller respond to them.
 
 A fault is one line, "SIGNAL KIND [key=value ...]", see docs/fault_injection.md. Times are simulated seconds since
 the start of the session. The same lines and seeds give the same messages. The plant is not affected. This module
@@ -71,7 +71,7 @@ OTHER_KINDS = {
     "names": {"reorder": ((), ()), "wrong": ((), ())},
 }
 
-#: They begin `at` a time and have no end.
+#: Faults that begin `at` a time and have no end.
 EVENTS = (("clock", "jump"), ("session", "change"))
 
 
@@ -283,7 +283,7 @@ class FaultInjector:
         return _with_second_source(acting, self._messages(out, now, time))
 
     def _held(self, number, fault, out, acts):
-        """The message of the fault's start: all of it, or under the present number and stamp."""
+        """The message from the fault's start: all of it, or with the present number and stamp."""
         if not acts:
             self._kept.pop(number, None)
             return out
@@ -328,7 +328,7 @@ class FaultInjector:
             values[where] = {"nan": np.nan, "inf": np.inf, "huge": HUGE}[fault.kind]
 
     def _past(self, number, fault, values, time):
-        """The values of the fault's delay ago; before the start, the first ones."""
+        """The values from one delay of the fault ago; if there are none so old, the first ones."""
         past = self._kept.setdefault(number, [])
         past.append((time, values.copy()))
         while len(past) > 1 and past[1][0] <= time - fault.get("by", 0.0) + 1e-9:
@@ -366,7 +366,7 @@ class FaultInjector:
 
 
 def _exchange(values, where):
-    """Let an entry and the next one change places, the last with the first; the whole field: turn it round."""
+    """Exchange an entry with the next one, the last with the first; for the whole field: reverse it."""
     if isinstance(where, list):
         pair = [where[0], (where[0] + 1) % values.size]
         values[pair] = values[pair[::-1]]
@@ -385,7 +385,7 @@ def _lost(fault, sequence):
     if fault.kind != "drop":
         return False
     fraction = fault.get("share", 1.0)
-    # By the sequence alone: the same samples are lost whenever the fault was set.
+    # It depends on the sequence alone: the same samples are lost whenever the fault was set.
     random = np.random.default_rng([fault.get("seed", 0), sequence])
     return fraction >= 1.0 or random.random() < fraction
 

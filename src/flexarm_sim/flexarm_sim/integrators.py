@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Integration of a plant: fixed steps in real time and in lockstep, error-controlled offline."""
+"""Integrates a plant: with fixed steps in real time and in lockstep, with error control offline."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -12,24 +12,24 @@ __all__ = [
     "turning_rate",
 ]  # fmt: skip
 
-#: Rate at which friction damps a joint that turns around, times a substep of an explicit method, at most; and so many
-#: times as many substeps at most: in longer ones light joints hunt [-].
+#: Largest product of an explicit method's substep and the rate at which friction damps a joint that reverses, and
+#: largest factor by which substeps are added for this: in longer substeps light joints hunt [-].
 FRICTION_PER_STEP, MOST = 2.0, 16
 
 
 def straight_mass_matrix(model):
     """Mass matrix of the straight arm, (n + m, n + m)."""
     none = np.zeros(model.n_joints)
-    if hasattr(model, "mass_matrix"):  # of a chain: all terms would compile its complex recursion
+    if hasattr(model, "mass_matrix"):  # a chain: all terms would compile its complex recursion
         return model.mass_matrix(none)
     return model.terms(none, none).M
 
 
 def turning_rate(model):
-    r"""Fastest rate at which friction damps a joint that turns around [1/s].
+    r"""Fastest rate at which friction damps a joint that reverses [1/s].
 
-    The largest eigenvalue of :math:`H\,\mathrm{diag}\bigl(f_v + (\max(f_c, f_b) + c\,u_{max})/v_0\bigr)`, with the
-    joints' block H of the straight arm's inverse mass matrix; see `description.Friction`.
+    It is the largest eigenvalue of :math:`H\,\mathrm{diag}\bigl(f_v + (\max(f_c, f_b) + c\,u_{max})/v_0\bigr)`, with
+    the joints' block H of the straight arm's inverse mass matrix; see `description.Friction`.
     """
     levels = []
     for joint in model.arm.joints:
@@ -43,7 +43,7 @@ def turning_rate(model):
 
 
 def plant_substeps(model, period, method="dop853"):
-    """`substeps` per sample of a `period` [s], and so many that friction does not make light joints hunt."""
+    """`substeps` per sample of a `period` [s], increased so that friction does not make light joints hunt."""
     count = substeps(model, period, method)
     if METHODS[method] is None:
         return count
@@ -73,7 +73,7 @@ def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):
     Raises
     ------
     ModelError
-        When the integration fails.
+        If the integration fails.
     """
 
     def derivative(t, s):

@@ -73,9 +73,9 @@ class Plant:
         self._run(torque, self._friction, fraction, self.substeps)
 
     def advance_damped(self, torque, damping, fraction=1.0):
-        """Advance by one period, or a fraction of it, under a torque less `damping` times the joints' velocities.
+        """Advance by one period, or a fraction of it, under a torque minus `damping` times the joints' velocities.
 
-        A velocity loop that is faster than any mode, as that of a drive.
+        This is a velocity loop that is faster than any mode, like that of a drive.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class Plant:
     def _damped(self, elapsed, speed):
         """Friction table, shape (n, 3), with the safe action `damp` added; arguments as for `Damping.torque`.
 
-        A joint's own Coulomb friction takes over the smoothing of the velocity loop.
+        A joint's own Coulomb friction gets the smoothing of the velocity loop.
         """
         table, where = self._friction.copy(), self._damping.active
         torque = self._damping.torque(elapsed, speed)
@@ -172,7 +172,7 @@ class Plant:
     def _brake_torque(self, joint, inertia):
         if joint.brake_torque is not None:
             return joint.brake_torque
-        # Not given: the torque that stops the rigid arm from 1 rad/s in 0.1 s.
+        # If not given: the torque that stops the rigid arm from 1 rad/s in 0.1 s.
         return joint.limits.torque if np.isfinite(joint.limits.torque) else 10.0 * inertia
 
     def _inertia(self):

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Drives that take positions, velocities or efforts: the joint loop of an industrial drive before the simulated arm.
+r"""Simulates industrial drives before the simulated arm: joint loops that take positions, velocities or efforts.
 
-A joint_trajectory_controller (JTC), or a robot's own controller, commands positions at its rate, say 125 Hz. The drive
-of each joint closes a loop around them at a rate of its own,
+A joint_trajectory_controller (JTC), or a robot's own controller, commands positions at its rate, for example 125 Hz.
+The drive of each joint closes a loop around them at a rate of its own,
 
 .. math:: u = \mathrm{sat}\bigl(k_p (r - q) + k_d (\dot r - \dot q) + i + g(q) + u_c\bigr), \qquad \dot i = k_i (r - q),
 
-with the torque limit of the joint, an integral part i that stands still while the torque is at its limit and would grow
-further, the weight g(q) of the rigid arm where that is asked for, and the effort :math:`u_c` of the command, if any.
-It knows nothing of bending. From a natural frequency :math:`\omega` and a damping ratio :math:`\zeta` follow
+with the torque limit of the joint. The integral part i stops while the torque is at its limit and would grow further.
+The weight g(q) of the rigid arm is optional, and :math:`u_c` is the effort of the command, if any. The drive does not
+know of bending. A natural frequency :math:`\omega` and a damping ratio :math:`\zeta` give
 
 .. math:: k_p = J\omega^2, \qquad k_d = 2\zeta J\omega,
 
-with the inertia J that the joint of the straight rigid arm turns while the others stand still.
+with the inertia J that the joint of the straight rigid arm turns while the other joints stand still.
 
-The velocity loop is faster than any mode, as that of a real drive: the link behind a light hub yields, so that it acts
-on the hub's inertia alone. Within a sample of the simulated arm it acts continuously, the rest of the torque is
-constant. Where the torque meets its limit, the loop is closed in steps within the sample, and bounded in each.
+As in a real drive, the velocity loop is faster than any mode: the link behind a light hub yields, so the loop acts on
+the hub's inertia alone. Within a sample of the simulated arm it acts continuously, and the rest of the torque is
+constant. If the torque meets its limit, the loop is closed in steps within the sample, and bounded in each.
 
-What a command has says what it means, joint by joint for all joints alike: positions, with velocities as their
-feed-forward; velocities alone, whose integral is the reference; efforts alone, which are passed on.
+The fields of a command determine what it means, for all joints alike: positions, with velocities as their feed-forward;
+velocities alone, whose integral is the reference; or efforts alone, which are passed on.
 """
 
 import math
@@ -50,23 +50,23 @@ PARAMETERS = (
         "Gains of the integral parts."
     ),
     parameter("gravity", True, read_only=True).described(
-        "Whether the drives bear the weight of the rigid arm, with the payload of the arm file."
+        "Whether the drives compensate the weight of the rigid arm, with the payload of the arm file."
     ),
     parameter("command_rate", 125.0, "Hz", 1.0, 20000.0, read_only=True).described(
-        "Rate of the commands, over whose period they are interpolated."
+        "Rate of the commands. They are interpolated over its period."
     ),
     parameter("interpolation", "linear", choices=("hold", "linear"), read_only=True).described(
-        "From one position command to the next: hold, in a step; linear, within a period of the commands."
+        "Path from one position command to the next. hold: a step; linear: within a period of the commands."
     ),
     parameter("command_delay", 0.008, "s", 0.0, 10.0, read_only=True).described(
-        "From a command until it acts: transport and computation."
+        "Time from a command until it acts: transport and computation."
     ),
 )
 #: Eigenvalues of the sampled loop may be outside of the unit circle by this much: rounding [-].
 ROUNDING = 1e-9
-#: The sampled loop must be stable with so many times its gains [-].
+#: The sampled loop must be stable with its gains multiplied by this [-].
 MARGIN = 1.5
-#: Rate of the velocity loop times a step of it, where the torque is at its limit [-]; most steps in a sample.
+#: Rate of the velocity loop times its step, while the torque is at its limit [-]; max. number of steps in a sample.
 RATE_PER_STEP, MAX_STEPS = 0.5, 100
 
 
@@ -78,7 +78,7 @@ class PositionLoop:
     model : ArmModel
         As the drives know it: inertia, weight and torque limits.
     period : float
-        Of the samples of the simulated arm [s].
+        Sample period of the simulated arm [s].
     settings : mapping
         Checked values of `PARAMETERS`.
 
@@ -89,12 +89,12 @@ class PositionLoop:
     reference, reference_velocity : ndarray, shape (n,)
         What the loops follow now [rad], [rad/s].
     saturated : ndarray of bool, shape (n,)
-        Whose torque was at its limit.
+        Joints whose torque was at its limit.
 
     Raises
     ------
     DesignError
-        Where the sampled loop around the arm that bends is unstable.
+        If the sampled loop around the flexible arm is unstable.
     """
 
     def __init__(self, model, period, settings):
@@ -155,7 +155,7 @@ class PositionLoop:
         Raises
         ------
         MessageError
-            Where numbers are missing or not finite; the last command goes on then.
+            If numbers are missing or not finite; then the last command remains active.
         """
         n = self.reference.size
         taken = [
@@ -172,7 +172,7 @@ class PositionLoop:
         self._waiting.append((time + self._delay, taken))
 
     def torque(self, time, position, velocity):
-        """The torques for measured joints at a time; call once in each `period`, or have `drive` do it.
+        """The torques for measured joints at a time; call it once in each `period`, or let `drive` call it.
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class PositionLoop:
         return out
 
     def _held(self, time, position):
-        """Torque of the drives but for the part of the measured velocity, of commands that act by now [N m]."""
+        """Torque of the drives by the commands that act by now, without the part of the measured velocity [N m]."""
         while self._waiting and self._waiting[0][0] <= time + 1e-9:
             self._act(*self._waiting.popleft()[1])
         if self._passes:
@@ -254,7 +254,7 @@ class PositionLoop:
         return out
 
     def _act(self, position, velocity, effort):
-        """A command acts from now on."""
+        """Make a command active."""
         self._effort, self._passes = effort, False
         self._target, self._left, self._rate = None, 0, None
         if position is not None:
@@ -267,7 +267,7 @@ class PositionLoop:
             self._passes = True
 
     def _advance(self):
-        """The reference of the next period of the drives."""
+        """Advance the reference to the next period of the drives."""
         velocity = self.reference_velocity
         if self._passes:
             return

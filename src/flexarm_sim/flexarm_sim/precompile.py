@@ -21,7 +21,7 @@ ARMS = ("R", "one_link", "two_link", "long_reach", "rigid")
 
 
 def main():
-    """Run each kernel once, on two cores; numba caches what it compiles for that."""
+    """Run each kernel once, on two cores; numba caches what it compiles for this."""
     with ProcessPoolExecutor(2) as pool:
         jobs = [pool.submit(job, geared) for geared in (False, True) for job in (linearise, loops)]
         for job in [*jobs, pool.submit(arms)]:

@@ -42,7 +42,7 @@ class Sensors:
         self._low, self._high = np.array([g.range for g in arm.gauges]).reshape(-1, 2).T
         self._count = np.array([g.step for g in arm.gauges])  # [-] strain per count
         self._counted = self._count > 0.0
-        # Asked of every sample: an array takes longer to say it than to be rounded.
+        # Needed at every sample: finding this out from an array takes longer than rounding it.
         self._drifts, self._is_noisy = bool(self.walk.any()), bool(self.sigma.any())
         counts = np.array([j.encoder_counts for j in arm.joints], float)
         self._step = np.where(counts > 0, 2.0 * np.pi / np.where(counts > 0, counts, 1.0), 0.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated arm with its sensors, sample by sample: the mathematics of the simulator node."""
+"""Simulates the arm with its sensors, sample by sample: the mathematics of the simulator node."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ CHECK_PERIOD = 0.01
 
 PARAMETERS = (
     parameter("arm", "", read_only=True).described(
-        "Arm file: a shipped name, such as R or two_link, or a path. Names and the strain map are this file's."
+        "Arm file: a shipped name, such as R or two_link, or a path. Names and the strain map come from it."
     ),
     parameter("plant_arm", "", read_only=True).described(
         "Arm file of the simulated arm itself, when it differs from `arm`; empty: the same."
@@ -38,9 +38,9 @@ PARAMETERS = (
         "Control rate: samples per second of simulated time."
     ),
     parameter("integrator", "dop853", choices=tuple(integrators.METHODS), read_only=True).described(
-        "Fixed-step method: dop853 and rk4 in substeps short enough for the highest mode and, up to 16 times as many,"
-        " for the friction of light joints; implicit damps modes"
-        " too fast for the period, in one step, which may be too long for a bent arm or a light hub (docs/dynamics.md)."
+        "Fixed-step method. dop853 and rk4 take substeps short enough for the highest mode, and up to 16 times as many"
+        " for the friction of light joints. implicit damps modes that are too fast for the period, in one step; this"
+        " step may be too long for a bent arm or a light hub (docs/dynamics.md)."
     ),
     parameter("initial_position", [0.0], "rad", -100.0, 100.0, length="joints").described(
         "Joint angles after a start or reset."
@@ -53,7 +53,7 @@ PARAMETERS = (
         "Publish the true rates of the observed modes in modal_rate: for tests; no real arm has them."
     ),
     parameter("publish_joint_velocity", True, read_only=True).described(
-        "Publish joint velocities; false: as a driver that has an encoder alone."
+        "Publish joint velocities; false: like a driver that has only encoders."
     ),
     parameter("publish_modal_amplitude", True, read_only=True).described(
         "Publish the modal amplitudes that the simulator maps from the strains; false: the observer maps them."
@@ -79,9 +79,8 @@ class Simulator:
         Its time [ns]: sequence times the period, from `START_NS`.
     position, velocity, torque, strain, amplitude, rate : ndarray
         The present sample: joint position (n,) [rad], velocity (n,) [rad/s], of motors or links as the encoders
-        measure them, torque applied until now (n,)
-        [N m], strain (gauges,), modal amplitudes derived from the strains and true rates of the observed
-        modes (m,).
+        measure them, torque applied until now (n,) [N m], strain (gauges,), modal amplitudes derived from the strains,
+        and true rates of the observed modes (m,).
     """
 
     #: Simulated time starts here, not at 0: a stamp of 0 means "now" in a trajectory.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Markdown: tables, and text that a command writes between two markers of a document."""
+"""Writes Markdown: tables, and text between two markers of a document."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 
 def table(columns, rows):
-    """Lines of a Markdown table; in its `rows`, below the `columns`, floats get three digits and None is a dash."""
+    """Lines of a Markdown table with `columns` and `rows`; floats get three digits, and None is a dash."""
     lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
     return lines + ["| " + " | ".join(map(_cell, row)) + " |" for row in rows]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How figures are made: without a screen, in one style, and the same file for the same numbers."""
+"""Makes figures without a screen, in one style, with the same file for the same numbers."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ STYLE = {
     "lines.linewidth": 1.3,
     "svg.hashsalt": "flexarm",
 }
-#: What files would hold of the day and the program.
+#: Metadata about date and program, which files must not contain.
 _NOTHING = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 

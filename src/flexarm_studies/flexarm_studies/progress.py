@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of long commands: a bar on a terminal, a line per step elsewhere."""
+"""Shows the progress of long commands: a bar on a terminal, a line per step elsewhere."""
 
 import sys
 import time

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results that are kept as they come, in a file of JSON lines: none is computed twice."""
+"""Keeps results as they come in a file of JSON lines, so none is computed twice."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from .workers import results
 
 
 class Store:
-    """Results in a JSON-lines file, so that an interrupted study goes on.
+    """Results in a JSON-lines file, so an interrupted study can go on.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class Store:
     Attributes
     ----------
     results : dict
-        Those already in the file and those added, by their ``sample``.
+        Results already in the file and those added, by their ``sample``.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class Store:
         )
 
     def append(self, row):
-        """Keep a `row`, in the file at once."""
+        """Keep a `row`, and write it to the file at once."""
         self.results[row["sample"]] = row
         if self._file is not None:
             self._write(row)

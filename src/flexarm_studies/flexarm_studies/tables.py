@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of numbers over time: reading torques and motions from CSV, writing results."""
+"""Handles tables of numbers over time: reads torques and motions from CSV, writes results."""
 
 import csv
 import io
@@ -13,7 +13,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 
 class TableError(FlexarmError):
-    """A table that can't be used; names the file and where in it."""
+    """A table that can't be used; names the file and the place in it."""
 
 
 def read(path, prefix, names):
@@ -45,7 +45,7 @@ def read(path, prefix, names):
 
 
 def has_columns(path, *names):
-    """Whether a path is of a CSV file whose first line has columns with these names."""
+    """Whether a path is that of a CSV file whose first line has columns with these names."""
     if not Path(path).is_file():
         return False
     try:
@@ -63,7 +63,7 @@ def cells(path, delimiter=","):
     ----------
     path : str or Path
     delimiter : str, optional
-        Between words; of blanks any number counts as one. None: the one of ``; tab , blank`` that is first found in the
+        Separator between words; several blanks count as one. None: the first of ``; tab , blank`` that is found in the
         first line.
 
     Returns
@@ -74,7 +74,7 @@ def cells(path, delimiter=","):
     Raises
     ------
     TableError
-        For a file that is no text.
+        For a file that is not text.
     """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -107,10 +107,10 @@ def _numbers(path, lines, header, rows, wanted):
 
 
 def numbers(path, lines, rows, at, name, blank=True, decimal="."):
-    """Column `at` of `rows`, shape (k,); `lines` are their numbers and `name` is the column's, for messages.
+    """Column `at` of `rows`, shape (k,); for messages, `lines` are their line numbers and `name` is that of the column.
 
-    With `blank` an empty cell and ``nan`` are NaN, else they are refused, as any other number that is not finite.
-    The `decimal` sign may be a comma.
+    With `blank` an empty cell and ``nan`` are NaN; otherwise they are refused, like any other number that is not
+    finite. The `decimal` sign may be a comma.
     """
     try:
         values = np.array([float(row[at].replace(decimal, ".") or "nan") for row in rows])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where many runs are computed: in this process, in worker processes, or on a Dask cluster."""
+"""Computes many runs in this process, in worker processes, or on a Dask cluster."""
 
 import multiprocessing
 import os
@@ -29,17 +29,17 @@ def results(function, calls, workers=None, scheduler=None):
     Parameters
     ----------
     function : callable
-        Of a module, so that other processes find it.
+        A function of a module, so other processes find it.
     calls : sequence of tuple
     workers : int, optional
-        Number of processes; one per core if not given. 1: everything in this process.
+        Number of processes; one per core if not given. 1: all in this process.
     scheduler : str, optional
         Address of a Dask scheduler to use instead; its workers need flexarm. `PROCESSES`: none.
 
     Raises
     ------
     FlexarmError
-        For fewer than one worker, and where Dask is not installed or its scheduler can't be reached.
+        For fewer than one worker, and if Dask is not installed or its scheduler can't be reached.
     """
     if workers is not None and workers < 1:
         raise FlexarmError("is too small", field="--workers", value=workers, limit="1 or more")

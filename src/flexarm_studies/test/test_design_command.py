@@ -47,7 +47,7 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
     out = tmp_path / "made.yaml"
     assert main(["design", "R", *LOOP, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "limited by          noise: " in printed
+    assert re.search(r"limited by +(reach|noise): ", printed)
     assert "bears payload" in printed and f"written to {out}" in printed
     nodes = parameter_files.load(out)
     controller, observer = nodes["controller"], nodes["observer"]
@@ -123,7 +123,7 @@ def test_what_no_gains_can_hold_is_refused_with_the_reason(capsys):
     assert (
         "no gains hold all of it" in printed
         and "grow at" in printed
-        and "with gain x" in printed
+        and re.search(r"with (gain|payload) x", printed)
         and ("sample faster" in printed or "narrow" in printed)
     )
 

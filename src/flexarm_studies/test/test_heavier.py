@@ -48,10 +48,10 @@ def test_the_sentences_have_the_runs_own_numbers(summaries):
     slow, composite, designed = summaries
     text = "\n".join(tables.gained(summaries))
     for row in summaries:
-        assert f"{row['peak_joint_error_deg']:.2f} deg" in text
+        assert f"{row['peak_joint_error_deg']:.2g} deg" in text
         assert f"{row['settling_time_s']:.2f} s after" in text
     ratio = composite["peak_joint_error_deg"] / designed["peak_joint_error_deg"]
-    assert f"{ratio:.2g} times less joint error" in text
+    assert f"{float(f'{ratio:.2g}'):g} times less joint error" in text
     never = [slow | {"settling_time_s": None}, composite, designed]
     assert "does not come to rest within 1 mm" in "\n".join(tables.gained(never))
     assert "rests far sooner" in tables.compared(never)[1]

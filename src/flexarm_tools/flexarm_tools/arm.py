@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm in a few lines of Python, over ROS: starts the nodes of a simulated one, or joins those that run.
+"""An arm in a few lines of Python, over ROS: starts the nodes of a simulated arm, or joins nodes that run.
 
     from flexarm_tools.arm import Arm
 
@@ -33,11 +33,11 @@ from flexarm_studies.loop.arm import Arrival, BaseArm, MotionError, Reading, Rec
 from .recording.recorder import Recorder, keep_for_recording, to_record
 from .running.processes import Processes, own_domain
 
-#: A loop that runs is found within this time, and where it must run within the second [s].
+#: Timeout for finding a loop that may run, and for one that must run [s].
 JOIN, MUST_JOIN = 2.0, 15.0
 #: A goal without an answer is sent again after this time; the arm has this long to stop after Ctrl-C [s].
 AGAIN, STOPPING = 3.0, 10.0
-#: Longer than any motion: a motion's end is waited for as long as the nodes are there [s].
+#: Longer than any motion: the end of a motion is awaited as long as the nodes are there [s].
 FOR_EVER = 1e9
 STATES = {
     getattr(CompositeState, name): name
@@ -53,24 +53,24 @@ class Arm(BaseArm):
     arm : str, optional
         Arm file: shipped name or path. Not given: that of the controller that runs.
     join : bool, optional
-        True: work with nodes that run, False: start simulator, observer, controller and action server of one's own,
-        apart from all others; not given: join if something runs, else start.
+        True: work with nodes that run. False: start a separate simulator, observer, controller and action server. Not
+        given: join if something runs, otherwise start.
     namespace : str
         Of the nodes that run.
     file : str or Path, optional
         Parameter file of nodes to start; not given: the arm's shipped one, for another arm a design.
     parameters : mapping, optional
-        Of nodes to start, beyond the file: name to value.
+        Parameters of nodes to start, beyond the file: name to value.
     real_time : bool
-        Whether nodes to start run in real time; else in lockstep, as fast as the machine goes, so that a busy machine
-        loses no sample.
+        Whether nodes to start run in real time; otherwise they run in lockstep, as fast as the machine allows, so a
+        busy machine loses no sample.
     progress : callable, optional
         Called with the seconds since a motion began.
 
     Raises
     ------
     WaitError
-        Where nothing runs that can be joined, or a node that was started does not come up.
+        If nothing runs that can be joined, or if a started node does not come up.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class Arm(BaseArm):
         return plain(answer.values[0])
 
     def _look(self):
-        """Take the newest messages; whether there is one of each."""
+        """Take the newest messages; return whether there is one of each."""
         self._state = self._states.take() or self._state
         self._estimate = self._estimates.take() or self._estimate
         return self._state is not None and self._estimate is not None
@@ -207,7 +207,7 @@ class Arm(BaseArm):
         return Arrival(1e-9 * (stamp_ns(self._state.header.stamp) - start), result.tip_swing)
 
     def wait(self, seconds):
-        """Wait for so long, by the wall clock, and take what comes [s]."""
+        """Wait for `seconds` of the wall clock, and take what comes [s]."""
         self.session.serve(seconds)
 
     def stop(self):

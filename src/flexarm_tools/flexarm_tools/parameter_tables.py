@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of all parameters in Markdown, from the declarations that the nodes validate with."""
+"""Writes tables of all parameters in Markdown, from the declarations with which the nodes validate."""
 
 import json
 
@@ -74,7 +74,7 @@ def write(file):
     Raises
     ------
     FlexarmError
-        When the file has no markers.
+        If the file has no markers.
     """
     write_between(file, BEGIN, END, tables())
 

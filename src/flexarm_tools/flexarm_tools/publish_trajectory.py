@@ -15,9 +15,9 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_studies.commands.options import numbers
 
-#: Points of the message; quintics between them follow the first two exactly, or nearly so, with few.
+#: Number of points of the message: few suffice, as quintics between them follow these families exactly, or nearly so.
 POINTS = {"paper": 101, "quintic": 101}
-#: Settings of the families as options: lists of numbers, and those that are taken as they are written.
+#: Settings of the families as options: lists of numbers, and options that are taken as they are written.
 _LISTS = ("from", "to", "tip", "via", "torque-limit", "velocity-limit")
 _PLAIN = ("duration", "smoothness", "shaper", "shape-modes")
 
@@ -97,7 +97,7 @@ def settings_of(options):
 
 
 def profile_of(options, reference, arm=None):
-    """The motion that the options describe, from `reference` unless they say from where.
+    """The motion that the options describe; it starts at `reference` unless they give a start.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def profile_of(options, reference, arm=None):
     reference : sequence of n float
         [rad]
     arm : ArmModel, optional
-        Built from the options where it is needed and not given.
+        Built from the options if it is needed and not given.
     """
     settings = settings_of(options)
     if arm is None and specs.needs_model(options.profile, settings):
@@ -114,17 +114,17 @@ def profile_of(options, reference, arm=None):
 
 
 def points_of(options):
-    """How many points the message has."""
+    """Number of points of the message."""
     return POINTS.get(options.profile, specs.POINTS) if options.points is None else options.points
 
 
 def prepare(options):
-    """Write the motion to a file, say what it is and excites, or both; without ROS.
+    """Write the motion to a file, describe it and what it excites, or both; without ROS.
 
     Raises
     ------
     FlexarmError
-        When there is no such motion, or it is beyond the arm's limits.
+        If there is no such motion, or it is beyond the arm's limits.
     """
     arm = model.build(arm_file.load(options.arm).known)
     profile = profile_of(options, np.zeros(arm.n_joints), arm)
@@ -168,7 +168,7 @@ def effects(profile, arm):
 
 
 def description(found):
-    """What `prepare` found, for people."""
+    """The result of `prepare` as text for people."""
     lines = [f"{found['profile']}: {found['duration_s']:.6g} s"]
     for joint in found["joints"]:
         torque, limit = joint["peak_slow_torque_Nm"], joint["torque_limit_Nm"]
@@ -199,14 +199,14 @@ def _of(limit):
 def publish(options, ros_args=None):
     """Publish once, with stamp 0 (now), and report whether the controller accepted it.
 
-    With ``--dry-run`` or ``--out`` nothing is published: `prepare`.
+    With ``--dry-run`` or ``--out`` nothing is published; `prepare` is called instead.
 
     `ros_args` go to rclpy as they are.
 
     Raises
     ------
     FlexarmError
-        When there is no controller, or it refuses the trajectory.
+        If there is no controller, or it refuses the trajectory.
     """
     if options.dry_run or options.out:
         prepare(options)
@@ -221,7 +221,7 @@ def publish(options, ros_args=None):
     arm = arm_file.load(options.arm).known
     names = arm.joint_names
     built = model.build(arm) if specs.needs_model(options.profile, settings_of(options)) else None
-    if options.profile not in ("line", "arc"):  # whose way depends on where the arm is
+    if options.profile not in ("line", "arc"):  # their path depends on where the arm is
         profile_of(options, [0.0] * len(names), built)  # refuse wrong options before waiting
     with Session("publish_trajectory", args=ros_args or (), patience=options.timeout) as session:
         states = session.tap(CompositeState, "controller/state")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm simulate``: the command of `flexarm_studies`, and the bag that ``--bag`` asks for, which needs ROS."""
+"""``flexarm simulate``: runs the command of `flexarm_studies`, and writes the bag of ``--bag``, which needs ROS."""
 
 from functools import partial
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slow law, fast law, manifold, feed-forward and observer from parameters, for nodes and for the loop without ROS.
+"""Builds slow law, fast law, manifold, feed-forward and observer from parameters, for nodes and the loop without ROS.
 
 Parameters are flat, as in ROS (``{"slow.type": "model_following", "slow.kp": [6.25], "rate": 500.0}``); `flat` makes
-them so from nested ones. Parameters of components that are not chosen are left out: one file may hold those of several
+them from nested ones. Parameters of components that are not chosen are ignored, so one file may hold those of several
 laws. A name that no component of the group knows is refused.
 
-Below, `name` is a key of `COMPONENTS`, and `values` are flat parameters: what is missing takes the node's default.
+Below, `name` is a key of `COMPONENTS`, and `values` are flat parameters. Missing ones have the node's defaults.
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ class Slot(NamedTuple):
     common: tuple = ()  # parameters that belong to no single component of the group
 
 
-#: By the prefix of their parameters.
+#: Slots by the prefix of their parameters.
 COMPONENTS = {
     "slow": Slot(
         SLOW,
@@ -45,7 +45,7 @@ COMPONENTS = {
     "manifold": Slot(
         MANIFOLD,
         parameter("type", "corrected").described(
-            "Slow manifold that the fast control holds the deflections to, by its name in the entry-point group"
+            "Slow manifold to which the fast control holds the deflections, by its name in the entry-point group"
             " flexarm.manifolds; quasi_steady: the paper's."
         ),
     ),
@@ -57,7 +57,7 @@ COMPONENTS = {
         arm_observer.PARAMETERS,
     ),
 }
-#: Those that the controller is made of.
+#: The slots that the controller consists of.
 CONTROL = ("slow", "fast", "manifold")
 
 
@@ -97,15 +97,15 @@ def type_of(name, values):
 
 
 def declared(name, values):
-    """Parameters of the chosen component, the common ones of its group among them, as a tuple of `Parameter`."""
+    """Parameters of the chosen component, including the common ones of its group, as a tuple of `Parameter`."""
     slot = COMPONENTS[name]
     return (*slot.common, *registry.find(slot.group, type_of(name, values)).PARAMETERS)
 
 
 def chosen(name, values):
-    """The chosen component: ``{"type": …, its parameters}``, without those of the others of its group.
+    """The chosen component: ``{"type": …, its parameters}``, without parameters of other components of its group.
 
-    Names that belong to no component of the group stay: the design refuses them.
+    Names that belong to no component of the group stay, and the design refuses them.
     """
     given = under(values, name) | {"type": type_of(name, values)}
     own = {p.name for p in declared(name, values)} | {"type"}
@@ -116,17 +116,17 @@ def chosen(name, values):
 
 
 def choices(values):
-    """The arguments of `design` beside the model, from flat parameters: plain data, ready for another process."""
+    """The arguments of `design` except the model, from flat parameters: plain data that can go to another process."""
     of_design = {p.name for p in PARAMETERS}
     parts = {name: chosen(name, values) for name in CONTROL}
     return parts | {"settings": {k: v for k, v in values.items() if k in of_design}}
 
 
 def control(model, values):
-    """The `CompositeControl` that parameters describe, checked; errors as for `design`."""
+    """The checked `CompositeControl` that parameters describe; raises the errors of `design`."""
     return design(model, **choices(values))
 
 
 def observer(model, given):
-    """The `ArmObserver` that `given`, as `chosen` returns it, describes; errors as for `arm_observer.observe`."""
+    """The `ArmObserver` that `given`, a result of `chosen`, describes; raises the errors of `arm_observer.observe`."""
     return arm_observer.observe(model, *typed(given, "observer"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The design of the composite control: its components by name, their parameters, and the checks of the whole."""
+"""Designs the composite control: finds its components by name, and checks their parameters and the whole."""
 
 from flexarm_dynamics import registry
 from flexarm_dynamics.arm.description import MAX_MODES
@@ -22,59 +22,59 @@ PREFIX = {SLOW: "slow.", FAST: "fast.", MANIFOLD: "manifold."}
 #: Parameters of the whole design.
 PARAMETERS = (
     parameter("feedforward", "model").described(
-        "Motion that the arm is held to: none, the reference and the slow manifold; model, the nominal arm"
-        " simulated alongside, which bends without ringing; preview, one planned at receipt of a trajectory to"
-        " end at rest. Or another of the entry-point group flexarm.feedforwards."
+        "Motion that the arm is held to. none: the reference and the slow manifold; model: the nominal arm, simulated"
+        " alongside, which bends without ringing; preview: a motion planned when a trajectory is received, which ends"
+        " at rest; or another name of the entry-point group flexarm.feedforwards."
     ),
     parameter("feedforward_modes", 0, "-", 0, MAX_MODES).described(
-        "Bending modes per direction that the feed-forward knows, where they are more than in the arm file. The control"
-        " gets what the gauges show of them; 0: those of the file."
+        "Bending modes per direction in the feed-forward's model, if more than in the arm file. The control receives"
+        " what the gauges show of them; 0: those of the file."
     ),
     parameter("feedforward_level", "file", choices=("file", *LEVELS[2:])).described(
-        "Kinematics of bending that the feed-forward knows, where it is more than the arm file states: stiffening"
-        " (links keep their length), finite_slope (large slopes, too); of model chain alone."
+        "Kinematics of bending in the feed-forward's model, if more than the arm file states: stiffening (links keep"
+        " their length), finite_slope (large slopes, too); for model chain only."
     ),
     parameter("motion_velocity_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
-        "Corner of the filter by which the observer makes joint speeds (observer.joint_velocity_bandwidth, where"
-        " observer.measured_velocity is false): those of the feed-forward's motion pass it too, so that its lag is no"
-        " error; 0.0: none."
+        "Corner of the observer's filter of joint speeds (observer.joint_velocity_bandwidth, if"
+        " observer.measured_velocity is false). The speeds of the feed-forward's motion pass the same filter, so that"
+        " its lag is no error; 0.0: no filter."
     ),
     parameter("motion_rate_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
-        "The same of the rates of deflections, where the observer filters them (observer.bandwidth of"
-        " filtered_derivative); 0.0: none."
+        "The same for the rates of deflections, if the observer filters them (observer.bandwidth of"
+        " filtered_derivative); 0.0: no filter."
     ),
     parameter("saturation", "each", choices=("each", "together")).described(
-        "What the torque limit does to the feedback about a feed-forward: each joint is clipped by itself, or what is"
-        " fed back to all joints is scaled until none is beyond its limit, which keeps its direction."
+        "Effect of the torque limit on the feedback about a feed-forward. each: every joint is clipped by itself;"
+        " together: the feedback to all joints is scaled until none is beyond its limit, which keeps its direction."
     ),
     parameter("rate", 1000.0, "Hz", 1.0, 20000.0).described(
-        "Samples per second that the driver or simulator sends: what designs are checked at."
+        "Samples per second that the driver or simulator sends; designs are checked at this rate."
     ),
     parameter("stability_margin", 0.0, "1/s", -1e6, 1e3).described(
-        "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this."
+        "A design is refused unless all poles of the sampled full-order closed loop lie left of minus this value."
     ),
     parameter("payload_scale", 1.0, "-", 0.0, 100.0).described(
-        "Payload that feed-forward, manifold and slow law are made for, in parts of the arm file's; payload_estimate"
-        " sets it. The fast law stays that of the arm file."
+        "Payload that feed-forward, manifold and slow law are designed for, as a multiple of the arm file's;"
+        " payload_estimate sets it. The fast law stays that of the arm file."
     ),
 )
 
 
 def design_law(group, name, model, values, *known):
-    """As `component.make`, of a law of the `group` `SLOW`, `FAST` or `MANIFOLD`; what is `known`: for a manifold."""
+    """As `component.make`, for a law of the `group` `SLOW`, `FAST` or `MANIFOLD`; `known` is for a manifold."""
     return make(group, name, model, values, PREFIX[group], *known)
 
 
 def design(model, slow, fast, manifold=None, settings=None):
-    """Composite control from mappings with the key `type` and the component's parameters.
+    """Design a composite control from mappings with the key `type` and the component's parameters.
 
     Parameters
     ----------
     model : ArmModel
     slow, fast, manifold : mapping
-        ``{"type": "linear_model_following", "kp": [6.25], …}``; no manifold: the paper's.
+        ``{"type": "linear_model_following", "kp": [6.25], …}``; without a manifold, the paper's.
     settings : mapping, optional
-        Values of `PARAMETERS`; not given: the paper's design, without feed-forward and unchecked.
+        Values of `PARAMETERS`; if not given, the paper's design, without feed-forward and unchecked.
 
     Returns
     -------
@@ -83,7 +83,7 @@ def design(model, slow, fast, manifold=None, settings=None):
     Raises
     ------
     UnknownComponentError, ParameterError, DesignError
-        Nothing is made then.
+        Nothing is designed then.
     """
 
     def law(group, model, given, *known):
@@ -114,7 +114,7 @@ def design(model, slow, fast, manifold=None, settings=None):
     fuller = modes.fuller(0, level != "file", level == FINITE_SLOPE)
     if modes is not model:
         seen += (shown(model, fuller),)
-    # The manifold of first order: it is what the regulator of the fuller arm is held to, which takes up the rest.
+    # The manifold of first-order kinematics: the regulator of the fuller arm follows it, and takes up the rest.
     known = None if fuller is model else model
     motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q, known))
     together = chosen["saturation"] == "together"
@@ -122,7 +122,7 @@ def design(model, slow, fast, manifold=None, settings=None):
 
 
 def typed(given, prefix):
-    """The `type` and the parameters of `given`; `prefix` is that of the parameters, for a `ParameterError`."""
+    """The `type` and the parameters of `given`; a `ParameterError` names them with `prefix`."""
     values = dict(given)
     name = values.pop("type", None)
     if isinstance(name, str):

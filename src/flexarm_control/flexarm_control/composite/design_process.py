@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A second process that designs, so that no design holds the interpreter's lock while a sample waits for its torque.
+"""A second process for designs, so that no design holds the interpreter's lock while a sample waits for its torque.
 
-A design in a thread shares the lock of the controller's process: a step of the control path was measured to take two to
-three times as long meanwhile. The second process has a lower priority and a model of the same arm; it sends back the
-finished law. Models hold compiled code and are not sent: each process puts its own model in their place.
+A design in a thread shares the lock of the controller's process. Measured steps of the control path then took two to
+three times as long. The second process has a lower priority and a model of the same arm; it sends back the finished
+law. Models hold compiled code and are not sent; each process puts its own model in their place.
 """
 
 import io
@@ -23,18 +23,18 @@ from flexarm_dynamics.models.model import ArmModel
 from flexarm_dynamics.processes import end_with, step_back
 
 _MODEL = "model"
-#: How often a caller is asked whether it still waits [s].
+#: Interval at which a caller is asked whether it still waits [s].
 ASKED = 0.01
 #: What pickle raises for things that can't be sent.
 NOT_SENT = (pickle.PicklingError, TypeError, AttributeError)
 
 
 class AwayError(DesignError):
-    """The other process can't do this: it has died, or an argument or result can't be sent. It can be done here."""
+    """The process can't do the work: it has died, or an argument or result can't be sent. The caller can do it."""
 
 
 class _Pickler(pickle.Pickler):
-    """Writes every model of the arm, with whatever payload, and fuller ones of it, as a name."""
+    """Writes every model of the arm as a name, with any payload, and fuller models of the arm, too."""
 
     def __init__(self, file, arm):
         super().__init__(file, protocol=-1)
@@ -67,7 +67,7 @@ class _Unpickler(pickle.Unpickler):
             model = model if more is None else model.fuller(*more)
             model = self._models[scale, more] = model if scale == 1.0 else model.with_payload(scale)
             rest = np.zeros(model.n_joints)
-            # What they are computed from is made here, not on the control path.
+            # The data that terms are computed from are made here, not on the control path.
             model.terms(rest, rest)
         return self._models[scale, more]
 
@@ -75,7 +75,7 @@ class _Unpickler(pickle.Unpickler):
 def dumps(thing, arm):
     """A `thing`, such as a law or a plan, as bytes without the models of `arm`.
 
-    What can't be sent, such as a law with a model of another arm, raises one of `NOT_SENT`.
+    A thing that can't be sent, such as a law with a model of another arm, raises one of `NOT_SENT`.
     """
     file = io.BytesIO()
     _Pickler(file, arm).dump(thing)
@@ -83,7 +83,7 @@ def dumps(thing, arm):
 
 
 def loads(data, model):
-    """What `dumps` wrote, with `model`, or it with another payload, in the place of the models that it left out."""
+    """Read what `dumps` wrote; `model`, or a variant of it, takes the place of the models that it left out."""
     return _Unpickler(io.BytesIO(data), model).load()
 
 
@@ -105,7 +105,7 @@ def _work(function, data):
 
 
 class DesignProcess:
-    """Calls functions in a second process that has a model of the same arm, one after the other; its callers may wait.
+    """Calls functions, one after the other, in a second process that has a model of the same arm; its callers may wait.
 
     The process is started by the first call, and again after it has died. It ends with `close`, with the thread
     that made the first call, and with this process.
@@ -113,11 +113,11 @@ class DesignProcess:
     Parameters
     ----------
     model : ArmModel
-        The control path's: laws that come back hold it.
+        The control path's model; laws that come back hold it.
     niceness : int
-        Of the process, relative to this one.
+        Niceness of the process relative to this one.
     cpus : collection of int
-        That it runs on; empty: as this one.
+        CPUs that the process runs on; empty: as this one.
     """
 
     def __init__(self, model, niceness=10, cpus=()):
@@ -128,18 +128,18 @@ class DesignProcess:
     def call(self, function, *arguments, waits=None):
         """``function(model, *arguments)`` in the process.
 
-        The `function` is one of a module; the `arguments` and the result can be pickled, models of this arm aside.
-        Where `waits` is given, it is asked every `ASKED` whether the result is still wanted. The process goes on with
-        what is not wanted any more until that is done.
+        The `function` must be defined in a module. The `arguments` and the result must be picklable, except for models
+        of this arm. If `waits` is given, it is called every `ASKED` to ask whether the result is still wanted. The
+        process finishes a call even if its result is not wanted any more.
 
         Raises
         ------
         AwayError
-            When the process has died, or an argument or the result can't be sent.
+            If the process has died, or an argument or the result can't be sent.
         TimeoutError
-            When the result is not wanted any more.
+            If the result is not wanted any more.
         Exception
-            What the function raises.
+            Any error that the function raises.
         """
         try:
             data = dumps(arguments, self.model.arm)
@@ -158,12 +158,12 @@ class DesignProcess:
 
     @property
     def idle(self):
-        """Whether the process has been started, and has nothing to do."""
+        """Whether the process has been started and has nothing to do."""
         last = self._last
         return self._pool is not None and last is not None and last.done()
 
     def start(self, function):
-        """Call ``function(model)`` in the process without waiting; the process ends with the thread that calls this."""
+        """Call ``function(model)`` in the process without waiting; the process ends with the calling thread."""
         self._last = self._running().submit(_work, function, dumps((), self.model.arm))
 
     def _running(self):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Design work for one arm, off the control path: in a process of its own, or in the thread that asks for it."""
+"""Design work for one arm, off the control path: in a separate process, or in the thread that asks for it."""
 
 from concurrent.futures import CancelledError
 from dataclasses import replace
@@ -14,11 +14,11 @@ from .design_process import AwayError, DesignProcess
 
 
 def ready(model):
-    """Does nothing: calling it starts the process, which imports this module and builds the model."""
+    """Do nothing; the call starts the process, which imports this module and builds the model."""
 
 
 def prepare_next(model, feedforward, *arguments):
-    """``feedforward.prepare_next(*arguments)``, callable in the design process; its `model` is not needed."""
+    """``feedforward.prepare_next(*arguments)``, callable in the design process; `model` is not needed."""
     return feedforward.prepare_next(*arguments)
 
 
@@ -35,19 +35,19 @@ def judge(model, trajectory, start, limit):
 class Designer:
     """Designs controls and prepares trajectories; called from threads that may wait.
 
-    Where the process does not answer, or what it is to make can't be sent, the work is done in the calling thread.
+    If the process does not answer, or arguments or results can't be sent, the calling thread does the work.
 
     Parameters
     ----------
     model : ArmModel
-        The control path's: controls that the process designs hold it.
+        The control path's model; controls that the process designs hold it.
     warn : callable
         Called with a sentence when the process can't be used.
     process : bool
-        Whether to design in a process of its own. A thread holds up the control path now and then, since both need
-        the interpreter's lock.
+        Whether to design in a separate process. A thread sometimes delays the control path, since both need the
+        interpreter's lock.
     cpus : collection of int
-        That the process runs on; empty: as this one.
+        CPUs that the process runs on; empty: as this one.
     """
 
     def __init__(self, model, warn, process=True, cpus=()):
@@ -56,7 +56,7 @@ class Designer:
         self._process = DesignProcess(model, cpus=cpus) if process else None
 
     def start(self):
-        """Start the process, which ends with the calling thread; another thread may design then, and end."""
+        """Start the process, which ends with the calling thread; then other threads may design, and end."""
         if self._process is not None:
             self._process.start(ready)
 
@@ -70,20 +70,20 @@ class Designer:
                     self._warn(str(error))
 
     def design(self, values):
-        """The control that flat parameters describe, as `assembly.control`; a `CancelledError` after `close`."""
+        """The control that flat parameters describe, as `assembly.control`; raises a `CancelledError` after `close`."""
         try:
             return self._in_process(control, values)
         except AwayError:
-            # With a model of its own: meanwhile the control path uses the other one.
+            # With a separate model, because the control path uses the other one meanwhile.
             return control(build(self.model.arm), values)
 
     def prepare(self, feedforward, trajectory, start, waits=None):
-        """What `Feedforward.prepare` of the `feedforward` makes of a `trajectory` and its `start`.
+        """Result of `Feedforward.prepare` of the `feedforward` for a `trajectory` and its `start`.
 
-        After `close` a `CancelledError`.
+        Raises a `CancelledError` after `close`.
 
-        While ``waits()`` is true, where it is given: what is not there by then is left out, and the note names it; a
-        `DesignError` where nothing is.
+        If `waits` is given, the work goes on only while ``waits()`` is true. Parts that are not ready by then are left
+        out, and the note names them. If no part is ready, a `DesignError` is raised.
         """
         found = None
         while found is None or found.left:
@@ -105,14 +105,14 @@ class Designer:
         return found
 
     def find(self, settings, uncertainty):
-        """What `default.find` makes of the same `settings` and `uncertainty`; a `CancelledError` after `close`."""
+        """Result of `default.find` for `settings` and `uncertainty`; raises a `CancelledError` after `close`."""
         try:
             return self._in_process(find, settings, uncertainty)
         except AwayError:
             return find(self.model, settings, uncertainty)
 
     def judge(self, trajectory, start, limit):
-        """As `refuse_torque`: in the process where one is idle, else in this thread, which is soon done."""
+        """As `refuse_torque`: in the process if one is idle, otherwise in this thread, which takes little time."""
         if self._process is not None and self._process.idle:
             try:
                 return self._in_process(judge, trajectory, start, limit)
@@ -123,7 +123,7 @@ class Designer:
         refuse_torque(self._own, trajectory, start, limit)
 
     def _in_process(self, function, *arguments, waits=None):
-        """``function(model, *arguments)`` in the process; an `AwayError`, with a warning, where that can't be."""
+        """``function(model, *arguments)`` in the process; warns and raises an `AwayError` if this is not possible."""
         if self._process is None:
             raise AwayError("there is no design process")
         try:

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The full order closed loop, sampled: the arm with its bending under a composite control, linearised at rest.
+r"""The sampled full-order closed loop: the arm with its bending under a composite control, linearised at rest.
 
-The arm (2), linear about rest in a configuration, held by its torque against gravity, moves exactly from sample to
-sample,
+The arm (2) is linearised about rest in a configuration, where its torque holds it against gravity. From sample to
+sample it moves exactly by
 
-.. math:: s_{k+1} = \Phi s_k + \Gamma u_k, \qquad s = (q, \delta, \dot q, \dot\delta),
+.. math:: s_{k+1} = \Phi s_k + \Gamma u_k, \qquad s = (q, \delta, \dot q, \dot\delta) .
 
-and the control law is linearised as it is: its own `step` is differenced, so that whatever slow law, manifold and
-fast law there is counts. A fast law with states of its own brings them along, and a delay keeps the torques
-under way. Poles are given as those of continuous time, s = ln(z) / T.
+The control law is linearised by finite differences of its own `step`, so that its slow law, manifold and fast law are
+included, whatever they are. The states of a fast law that has some, and the torques under way in a delay, are states of
+the loop, too. Poles are given as those of continuous time, s = ln(z) / T.
 """
 
 import numpy as np
@@ -19,23 +19,23 @@ from flexarm_dynamics.linear import jacobian, linear_plant, sampled, state_at_re
 from ..component import at_rest
 from ..fast.none import NoFastLaw
 
-#: A pole may grow this fast [1/s] before a design counts as unstable where no margin is asked for: rounding.
+#: Allowance for rounding [1/s]: without a required margin, a design counts as unstable if a pole grows this fast.
 ROUNDING = 1e-6
 
 
 def linear_law(law, q):
-    """A composite control `law` linearised at rest: what the slow part does, and what the fast part sees.
+    """A composite control `law` linearised at rest: the output of its slow part and the input of its fast part.
 
     Returns
     -------
     U : ndarray, shape (n, 2 (n + m))
-        Slow torque, the manifold's feed-forward included.
+        Matrix of the slow torque, including the manifold's feed-forward.
     Z : ndarray, shape (2m, 2 (n + m))
-        z_f of the fast law.
+        Matrix of the fast law's z_f.
     """
     model = law.model
     n, m = model.n_joints, model.n_modes
-    # The fast law's gain is known.
+    # The fast law is left out, since its gain is known.
     reference, plain = at_rest(q), type(law)(model, law.slow, NoFastLaw(model, {}), law.manifold)
 
     def response(s):
@@ -55,23 +55,23 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
     ----------
     law : CompositeControl
     q : ndarray, shape (n,)
-        Where, at rest [rad].
+        Configuration of rest [rad].
     period : float
-        [s]
+        Sampling period [s].
     delay : float
-        From the measurement to the torque [s].
+        Time from the measurement to the torque [s].
     plant : ArmModel, optional
-        The arm itself, when it is not the law's model; of as many modes.
+        The arm itself, if it is not the law's model; it must have as many modes.
     gain : float
-        Of the torque on its way to the arm [-].
+        Factor of the torque on its way to the arm [-].
 
     Returns
     -------
     ndarray
-        Of (s, the fast law's states, torques under way, newest last).
+        Matrix for (s, the fast law's states, torques under way, newest last).
     """
     model = law.model
-    # A law that compensates Coulomb friction takes it to be as steep as at rest; to another one it is no damping.
+    # A law that compensates Coulomb friction takes it as steep as at rest. For another law it is no damping.
     A, B = linear_plant(plant or model, np.asarray(q, float), not law.slow.separate)
     B = gain * B
     n = B.shape[1]
@@ -95,7 +95,7 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
     command[:, : size + w] = np.hstack([U + Dc @ Z, Cc])
 
     def torque(age):
-        """Rows of u_{k - age} in the state."""
+        """Rows that select u_{k - age} from the state."""
         at = total - n * age
         return np.eye(total)[at : at + n] if age else command
 
@@ -109,7 +109,7 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
 
 
 def poles(law, q, period, delay=0.0, plant=None, gain=1.0):
-    """Poles of the sampled closed loop as those of continuous time [1/s], slowest first."""
+    """Poles of the sampled closed loop, given as those of continuous time [1/s], slowest first."""
     z = np.linalg.eigvals(closed_loop(law, q, period, delay, plant, gain)).astype(complex)
     z = z[np.abs(z) > 1e-12]  # dead-beat: a delay's own
     s = np.log(z) / period
@@ -122,7 +122,7 @@ def check(law, q, rate, margin=0.0):
     Raises
     ------
     DesignError
-        Naming the pole of the `law` in the configuration q of its design.
+        It names the pole of the `law` in the configuration q of its design.
     """
     field = f"poles of the full-order closed loop, sampled at {rate:g} Hz"
     try:

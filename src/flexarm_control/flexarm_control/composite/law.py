@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Composite control, (12) of Siciliano & Book (1986): u = u_slow(x) + u_fast(x, z_f).
 
-The deflections that go with the slow motion, z_bar, are what the fast control holds on to: z_f = z - z_bar. The
-paper takes their quasi-steady state (9); `manifold` has it and better ones. On the manifold z_f = 0 and u_fast = 0.
+The fast control holds the deflections to those of the slow motion, z_bar, by z_f = z - z_bar. The paper takes their
+quasi-steady state (9); `manifold` has it and better ones. On the manifold z_f = 0 and u_fast = 0.
 
-Two things would jump, and fade instead (module `fading`):
+Two jumps are made to fade (module `fading`):
 
-- A control that takes another one's place adds to its slow torque what the old one would have given more at that
-  sample. One for another payload that does so at rest takes it into the slow law's integral, as far as that goes; the
-  rest fades within two of the arm's lowest locked periods, so that the arm is not set ringing.
-- Without a feed-forward, slow torque and manifold jump where the reference goes over to another polynomial, with its
-  jerk and snap: what the polynomial before, continued, gives more is added. A feed-forward has that in its own motion.
+- A control that replaces another one adds to its slow torque the old control's torque minus its own at that sample. If
+  it is for another payload, this difference fades within two periods of the lowest mode with locked joints, so that the
+  arm does not ring. At rest, the slow law's integral first takes as much of the difference as it can.
+- Without a feed-forward, slow torque and manifold jump where the reference changes to another polynomial with another
+  jerk and snap. What the previous polynomial, continued, would give more is added. A feed-forward does this in its own
+  motion.
 """
 
 import numpy as np
@@ -23,8 +24,8 @@ from ..feedforward.model import At
 from ..manifold.quasi_steady import QuasiSteady
 from .seen import SeenMotion
 
-#: Rate at which the torque of another payload fades, over the lowest locked frequency: a hundredth is left after two
-#: periods.
+#: Ratio of the rate at which the torque of another payload fades to the lowest locked frequency: a hundredth is left
+#: after two periods.
 PAYLOAD_FADING = 8.4 / (4.0 * np.pi)
 
 
@@ -37,13 +38,14 @@ class CompositeControl:
     slow : SlowLaw
     fast : FastLaw
     manifold : Manifold, optional
-        The paper's, `QuasiSteady`, if not given.
+        If not given, the paper's, `QuasiSteady`.
     feedforward : Feedforward, optional
-        The motion that the arm is held to; the reference and the manifold's, if not given.
+        The motion that the arm is held to; if not given, the reference and its manifold.
     seen : tuple
-        What the observer does to that motion: the arguments of `SeenMotion` beside it.
+        How the observer would show that motion: the further arguments of `SeenMotion`.
     together : bool
-        Whether a joint at its torque limit scales the feedback of all, or is clipped alone. With a feed-forward.
+        Whether a joint at its torque limit scales the feedback of all joints, or is clipped alone; used only with a
+        feed-forward.
 
     Attributes
     ----------
@@ -65,12 +67,12 @@ class CompositeControl:
         self._last = None  # reference and interval of the last step
         n, rate = model.n_joints, fading_rate(model)
         self._limit = np.full(n, np.inf)
-        # Of the torque, from the control `_before` that this one replaces until its first step.
+        # Jump of the torque from the replaced control, which is `_before` until the first step of this one.
         self._exchanged, self._before = Fading(n, rate), None
-        self._other_payload = False  # than the control had that this one replaces
-        # Of (slow torque, delta_bar, its rate), since path, piece and stamp of the last step.
+        self._other_payload = False  # whether the replaced control had another payload
+        # Jumps of (slow torque, delta_bar, its rate); path, piece, stamp and position of the last step.
         self._pieces, self._source = Fading(n + 2 * model.n_modes, rate), None
-        # Of what motion, and the slow law's torque on it.
+        # A motion as bytes, and the slow law's torque on it.
         self._nominal, self._no_torque = (b"", np.zeros(n)), np.zeros(n)
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = self._seen = feedforward
@@ -86,7 +88,7 @@ class CompositeControl:
 
     @property
     def limit(self):
-        """Torque limit, which the feed-forward keeps to, shape (n,) [N m]; infinite: none."""
+        """Torque limit that the feed-forward keeps, shape (n,) [N m]; infinite: none."""
         return self._limit
 
     @limit.setter
@@ -104,7 +106,7 @@ class CompositeControl:
         return [part for part in parts if part is not None]
 
     def resume(self, other):
-        """Go on from another control's states and torque: a redesign does not begin anew."""
+        """Go on from another control's states and torque, so that a redesign does not start over."""
         self.slow.resume(other.slow)
         self.fast.resume(other.fast)
         if self.feedforward is not None and other.feedforward is not None:
@@ -117,12 +119,12 @@ class CompositeControl:
         self._other_payload = other.model.payload_scale != self.model.payload_scale
         if self._other_payload:
             self._exchanged.rate = PAYLOAD_FADING * lowest(self.model)
-        # One that has not had a sample has nothing to go on from.
+        # A control that has had no sample has nothing to go on from.
         self._before = other if other._last is not None else other._before
 
     @property
     def needs_rates(self):
-        """Whether the rates of the deflections are needed: an observer."""
+        """Whether the rates of the deflections, and so an observer, are needed."""
         return self.fast.needs_rates
 
     @property
@@ -131,7 +133,7 @@ class CompositeControl:
         return self.slow.drifts
 
     def reset(self):
-        """A new session begins: the laws forget their own states."""
+        """Begin a new session: the laws forget their own states."""
         for part in self._parts():
             part.reset()
         self._exchanged.clear()
@@ -139,18 +141,18 @@ class CompositeControl:
         self._last = self._before = self._source = None
 
     def step(self, q, qd, delta, delta_d, reference, dt=0.0):
-        """Torque for one sample; the control path.
+        """Torque for one sample; runs on the control path.
 
         Parameters
         ----------
         q, qd : ndarray, shape (n,)
             Joint position and velocity [rad], [rad/s].
         delta, delta_d : ndarray, shape (m,)
-            Modal amplitude and rate [m, rad], [m/s, rad/s]; the rate may be None for a fast law without it.
+            Modal amplitude and rate [m, rad], [m/s, rad/s]; the rate may be None for a fast law that needs none.
         reference : object
-            With `position`, `velocity`, `acceleration`, each (n,), and ``near``, as `Manifold.update` has it.
+            With `position`, `velocity`, `acceleration`, each (n,), and ``near``, as for `Manifold.update`.
         dt : float
-            Time since the last sample [s], for laws with states of their own; 0: the first one.
+            Time since the last sample [s], for laws with states of their own; 0: the first sample.
 
         Returns
         -------
@@ -176,11 +178,11 @@ class CompositeControl:
         return self.torque
 
     def _within_limit(self, u_slow, u_fast):
-        """Scale what is fed back, of all joints, so that no torque is beyond its limit; what `SlowLaw.saw` is to see.
+        """Scale the feedback of all joints so that no torque is beyond its limit; return what `SlowLaw.saw` is to see.
 
-        Gains from all joints to all joints are made for the direction of their torque. With one joint alone at its
-        limit the others may drive the arm on. Meanwhile all integrals wait: with less of all gains a loop may hold
-        without them alone.
+        Gains that couple all joints are designed for the direction of their torque. If one joint alone were clipped,
+        the others might drive the arm on. Meanwhile all integrals wait: with all gains reduced, a loop may be stable
+        only without them.
         """
         scaled = kernels.compiled().together(
             self.feedforward.torque, self._limit, u_slow, u_fast, self.torque, self._wanted
@@ -188,7 +190,7 @@ class CompositeControl:
         return self._wanted if scaled else self.torque
 
     def _goes_over(self, before, sample):
-        """Whether some of the torque of the control `before`, None if there was none at this `sample`, is left."""
+        """Whether torque of a replaced control is left at this `sample`; `before` is that control, or None."""
         fading = self._exchanged
         fading.advance(sample[-1])
         if before is not None and sample[-1] > 0.0:
@@ -215,7 +217,7 @@ class CompositeControl:
                 self._seen.update(dt)
 
     def _slow_on_manifold(self, q, qd, reference, dt):
-        """Slow torque towards the reference, and the manifold's z_bar with the torque that belongs to it."""
+        """Slow torque towards the reference, including the manifold's torque, and the manifold's z_bar."""
         terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
         fading, source = self._pieces, self._source
         fading.advance(dt)
@@ -236,7 +238,7 @@ class CompositeControl:
         return u, amplitude + more[1], rate + more[2]
 
     def _towards(self, q, qd, reference, terms):
-        """Slow torque towards a reference with the manifold's, (n,), delta_bar and its rate, (m,)."""
+        """Slow torque towards a reference, including the manifold's, (n,); delta_bar and its rate, (m,)."""
         u, manifold = self.slow_torque, self.manifold
         u[:] = self.slow.torque(q, qd, reference, terms)
         manifold.update(q, qd, reference, terms, u)
@@ -244,15 +246,15 @@ class CompositeControl:
         return u, manifold.amplitude, manifold.rate
 
     def _continued(self, source, dt):
-        """The reference that the last step's polynomial gives now, `dt` [s] after it."""
+        """The reference that the last step's polynomial would give now, `dt` [s] after that step."""
         path, _, stamp_ns, position = source
         return at_rest(position) if path is None else At(path, stamp_ns, dt)
 
     def _slow_about_motion(self, q, qd):
         """Slow torque about the feed-forward's motion, and that motion's deflections moved by the tracking error.
 
-        The motion's torque takes the place of what the slow law gives on the motion; the manifold's response to the
-        tracking error is added to both.
+        The motion's torque replaces the slow law's torque on the motion. The manifold's response to the tracking error
+        is added to torque and deflections.
         """
         u, motion, m, seen = self.slow_torque, self.feedforward, self.model.n_modes, self._seen
         if self.slow.separate:
@@ -267,7 +269,7 @@ class CompositeControl:
         return u, self._bar[:m], self._bar[m:]
 
     def _deviation(self, delta, delta_d, delta_bar, rate_bar):
-        """z_f = z - z_bar, shape (2m,); NaN in the place of rates that are not known."""
+        """z_f = z - z_bar, shape (2m,); unknown rates are NaN."""
         z_f, m = self.deviation, delta.size
         if delta_d is not None:
             kernels.compiled().deviation(
@@ -280,10 +282,10 @@ class CompositeControl:
         return z_f
 
     def look_ahead(self):
-        """Do beforehand what the next sample will need and what does not depend on it; call once the torque is sent.
+        """Compute ahead what the next sample needs and what does not depend on it; call once the torque is sent.
 
-        The reference at the next stamp is known if it comes as long after this one as this one came after the last;
-        otherwise, or without this call, the next step does that work itself, with the same result to the last bit.
+        The reference at the next stamp is known if the time to the next sample equals the time since the last one.
+        Otherwise, or without this call, the next step does the work itself, with the same result to the last bit.
         """
         if self.feedforward is None or self._last is None:
             return
@@ -292,7 +294,7 @@ class CompositeControl:
             self._nominal_torque(*foreseen)
 
     def _nominal_torque(self, position, velocity, acceleration):
-        """The slow law's torque on a motion, (n,); what was asked for last is remembered."""
+        """The slow law's torque on a motion, (n,); the last result is cached."""
         motion = position.tobytes() + velocity.tobytes() + acceleration.tobytes()
         if motion != self._nominal[0]:
             torque = self.slow.nominal_at(position, velocity, acceleration)

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The feed-forward's motion as an observer would see it.
+r"""Shows the feed-forward's motion as an observer would see it.
 
-An observer that has rates as filtered derivatives is late by 1 / omega_c, and a control that compares them with the
-motion's own rates takes the lag for an error: on a motion that the model explains it would push against it. So the
-motion's joints and deflections pass the same filter, sample by sample (module `observers.filtered_derivative`). Where
-the arm follows the motion both are equal, and no error is left.
+An observer whose rates are filtered derivatives is late by 1 / omega_c. A control that compares them with the motion's
+own rates takes the lag for an error, and pushes against a motion that the model explains. So the motion's joints and
+deflections pass the same filter, sample by sample (module `observers.filtered_derivative`). If the arm follows the
+motion, both are equal, and no error is left.
 
-The positions of the samples are what is filtered, as in the observer, and not the speeds between them: a torque that is
-held over a sample makes light hubs and fast modes swing within it, and the mean of the speeds at its ends is another.
-With it an arm on its motion was pushed off by 5 degrees.
+As in the observer, the filter acts on the positions at the samples, not on the speeds. A torque that is held over a
+sample makes light hubs and fast modes swing within it, so the mean of the speeds at both ends is not the mean speed.
+With that mean, an arm on its motion was pushed off by 5 degrees.
 
-A feed-forward may know more modes than the observer does (`feedforward_modes`). What the gauges would show of its
-amplitudes :math:`\delta'` is then, with their rows R (module `flexarm_dynamics.arm.strain_map`),
+A feed-forward may know more modes than the observer (`feedforward_modes`). The gauges, with their rows R (module
+`flexarm_dynamics.arm.strain_map`), would then show its amplitudes :math:`\delta'` as
 
 .. math:: \delta = R_o^+\,R'\delta' .
 """
@@ -24,9 +24,9 @@ from .. import kernels
 
 
 def shown(model, fuller):
-    """What the gauges of a `model`'s arm show of the modes of a `fuller` model of it, (m, k).
+    """Matrix, (m, k), of what the gauges of a `model`'s arm show of the modes of a `fuller` model of that arm.
 
-    Without gauges, or where they do not give all modes of the model: its own modes of the same names.
+    Without gauges, or if they do not give all modes of the model, it selects the modes of the same names.
     """
     arm = model.arm
     if len(arm.gauges) < model.n_modes or arm.observed_modes != model.mode_names:
@@ -37,15 +37,15 @@ def shown(model, fuller):
 
 
 class SeenMotion:
-    """A `Feedforward` as the observer shows it; see the module.
+    """A `Feedforward` as the observer would show it; see the module.
 
     Parameters
     ----------
     motion : Feedforward
     joint_corner, rate_corner : float
-        Of the observer's filters of joint speeds and of rates of deflections [rad/s]; 0.0: not filtered.
+        Corners of the observer's filters of joint speeds and of rates of deflections [rad/s]; 0.0: not filtered.
     shown : ndarray, shape (m, k), optional
-        What the gauges show of the motion's own k modes; all of them as they are if not given.
+        What the gauges show of the motion's own k modes; if not given, all modes as they are.
 
     Attributes
     ----------
@@ -69,13 +69,13 @@ class SeenMotion:
         return self._motion.position
 
     def take(self, other):
-        """Go on as another one, of the same motion, would."""
+        """Go on from the state of another `SeenMotion` of the same motion."""
         mine = (*self._last, self.velocity, self.rate)
         for values, its in zip(mine, (*other._last, other.velocity, other.rate), strict=True):
             values[:] = its
 
     def update(self, dt):
-        """Move on to the motion's present sample, `dt` [s] after the last one; 0: the first one."""
+        """Move on to the motion's present sample, `dt` [s] after the last one; 0: the first sample."""
         motion, own_rate = self._motion, self._own_rate
         np.dot(self._shown, motion.amplitude, out=self.amplitude)
         np.dot(self._shown, motion.rate, out=own_rate)
@@ -87,6 +87,6 @@ class SeenMotion:
             if corner == 0.0 or dt <= 0.0:
                 rate[:], last[:] = own, place
                 continue
-            if motion.placed:  # that makes no speed
+            if motion.placed:  # a jump of the position is no speed
                 last[:] = place - dt * own
             kernels.compiled().filtered_derivative(place, dt, corner, last, rate)

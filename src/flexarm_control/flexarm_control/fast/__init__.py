@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fast control laws: what damps the bending around its quasi-steady state. One law per file."""
+"""Fast control laws, which damp the bending about its quasi-steady state; one law per file."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Fast control with a gain that is given: u_fast = K_f z_f with the numbers of the parameter, and a low pass.
+r"""Fast control with a given gain: u_fast = K_f z_f with K_f from a parameter, and a low-pass filter.
 
-The gain is the design's result itself: that of `flexarm design`, or of a method of your own. It may be several sets,
-each made for a configuration of its own (`flexarm_control.schedule`).
+The gain itself is the result of a design, by `flexarm design` or by a method of your own. There may be several sets of
+gains, each made for its own configuration (`flexarm_control.schedule`).
 """
 
 import numpy as np
@@ -20,8 +20,8 @@ class FixedGain(FastLaw):
 
     PARAMETERS = (
         parameter("gain", [0.0], "N m/m, N m s/m", -1e12, 1e12, length="gain*").described(
-            "K_f of fixed_gain, row by row: for each joint the modal amplitudes, then the modal rates; a set for each"
-            " configuration of the schedule, or one for all."
+            "K_f of fixed_gain, row by row: for each joint the gains of the modal amplitudes, then of the modal rates;"
+            " one set for each configuration of the schedule, or one for all."
         ),
         SCHEDULE,
         CONFIGURATION,

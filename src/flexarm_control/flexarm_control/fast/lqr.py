@@ -10,7 +10,7 @@ with V the stabilising solution of
 .. math:: 0 = V(A_2 + \alpha I) + (A_2 + \alpha I)^T V - V B_2 R^{-1} B_2^T V + Q .
 
 (The published (18) has exp(-alpha tau); the published Riccati equation (20) is that of exp(+2 alpha t).)
-A2 and B2 of (11) are taken at one joint configuration, the end of the trajectory: no design is made under way.
+A2 and B2 of (11) are taken at one joint configuration, the end of the trajectory; the motion causes no new design.
 Every eigenvalue of the closed boundary layer has a real part below -alpha.
 """
 
@@ -25,7 +25,7 @@ from flexarm_dynamics.singular_perturbation import fast_subsystem, is_stabilisab
 
 from .base import FastLaw
 
-#: Q, R and alpha of (18): the same declarations in every law that solves (20).
+#: Q, R and alpha of (18), declared alike in every law that solves (20).
 WEIGHTS = (
     parameter("q", [1.0], "1/m^2, s^2/m^2", 0.0, 1e12, length="z").described(
         "Diagonal of Q in (18): modal amplitudes, then modal rates."
@@ -34,13 +34,13 @@ WEIGHTS = (
         "Diagonal of R in (18)."
     ),
     parameter("alpha", 5.0, "1/s", 0.0, 1e3).described(
-        "Prescribed degree of stability: closed fast poles lie left of -alpha."
+        "Prescribed degree of stability: the closed-loop fast poles lie left of -alpha."
     ),
 )
 
-#: Where a law with one design is designed.
+#: Configuration of a law with a single design.
 CONFIGURATION = parameter("configuration", [0.0], "rad", -100.0, 100.0, length="joints").described(
-    "Joint configuration of the design: the end of the trajectory."
+    "Joint configuration that the gain is designed for: the end of the trajectory."
 )
 
 
@@ -68,7 +68,7 @@ def regulator(model, q, parameters):
     Raises
     ------
     DesignError
-        A mode that has to be faster can't be reached, or (20) has no stabilising solution.
+        If the torques can't reach a mode that has to be faster, or (20) has no stabilising solution.
     """
     alpha = parameters["alpha"]
     A2, B2 = fast_subsystem(model.terms(q, np.zeros(model.n_joints)))
@@ -97,7 +97,7 @@ def regulator(model, q, parameters):
 
 def _solve(shifted, B2, q, parameters):
     """K_f and V of (20) for A2 + alpha I."""
-    # The import takes most of a second: only a design of this law waits for it.
+    # The import takes most of a second, so only a design of this law waits for it.
     import control
 
     try:
@@ -112,7 +112,7 @@ def _solve(shifted, B2, q, parameters):
 
 
 def least_reached(model, A2, B2, margin):
-    """Name of the modal coordinate that dominates the eigenvector B2 reaches least, right of -margin."""
+    """Name of the modal coordinate that dominates the eigenvector that B2 reaches least, of poles right of -margin."""
     poles, left, right = eig(A2, left=True)
     reach = np.linalg.norm(left.conj().T @ B2, axis=1)
     reach[poles.real < -margin - 1e-9 * np.linalg.norm(A2)] = np.inf

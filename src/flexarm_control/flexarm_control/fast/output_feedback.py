@@ -1,34 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Fast control from the modal amplitudes alone: optimal gain on an observer of the boundary layer.
+r"""Fast control from the modal amplitudes alone: an optimal gain on the estimate of a boundary-layer observer.
 
-Over a sample of length h under constant u_f the boundary layer (11), taken at one joint configuration, moves exactly by
+Over a sample of length h with constant u_f, the boundary layer (11), taken at one joint configuration, moves exactly by
 
 .. math:: z_{k+1} = \Phi z_k + \Gamma u_k, \qquad y_k = C z_k = \delta_k - \bar\delta_k, \qquad C = [I\;0].
 
-The law predicts over the time since the last sample and corrects by the amplitudes of this one,
+The law predicts the state over the time since the last sample, and corrects it with the amplitudes of this sample:
 
 .. math::
     \hat z^-_k = \Phi \hat z_{k-1} + \Gamma u_{k-1}, \qquad
     \hat z_k = \hat z^-_k + L\,(y_k - C\hat z^-_k), \qquad u_k = K_f \hat z_k,
 
-with K_f of (19), (20), the gain of `lqr`. The rates are not used. With :math:`\rho = e^{-ph}` and the blocks of Phi,
+where K_f of (19), (20) is the gain of `lqr`. The rates are not used. With :math:`\rho = e^{-ph}` and the blocks of Phi,
 
 .. math::
     L = \begin{bmatrix} (1-\rho^2)\,I \\
         (1-\rho)\,(\Phi_{22}\Phi_{12}^{-1} - \rho\,\Phi_{12}^{-1}\Phi_{11}) \end{bmatrix}
 
 places the poles of the error, :math:`e_k = (I - LC)\Phi e_{k-1}`, at rho times those of Phi. In continuous time each
-open fast pole moves to the left by p and keeps its frequency. A soft mode is thus observed by two poles near -p; the
+open fast pole moves to the left by p and keeps its frequency. So the error of a soft mode has two poles near -p. The
 error of a stiff mode is only damped, which takes little correction. By the separation principle the closed loop has
 these poles and those of Phi + Gamma K_f.
 
-Proof of L: eliminating the rates, amplitudes obey :math:`y_{k+2} = a_1 y_{k+1} + a_0 y_k` with
+Proof of L: with the rates eliminated, the amplitudes obey :math:`y_{k+2} = a_1 y_{k+1} + a_0 y_k` with
 :math:`a_1 = \Phi_{11} + \Phi_{12}\Phi_{22}\Phi_{12}^{-1}`,
-:math:`a_0 = \Phi_{12}\Phi_{21} - \Phi_{12}\Phi_{22}\Phi_{12}^{-1}\Phi_{11}`; their error with this L obeys
-:math:`e_{k+2} = \rho a_1 e_{k+1} + \rho^2 a_0 e_k`, the same with every pole times rho.
+:math:`a_0 = \Phi_{12}\Phi_{21} - \Phi_{12}\Phi_{22}\Phi_{12}^{-1}\Phi_{11}`. With this L their error obeys
+:math:`e_{k+2} = \rho a_1 e_{k+1} + \rho^2 a_0 e_k`: the same equation, with every pole multiplied by rho.
 
-The rate of the fastest mode can't be computed from amplitudes that are half its period apart (Phi12 is singular). Over
-a gap of more than 0.9 of that time, after lost samples, the law predicts and does not correct.
+The rate of the fastest mode can't be computed from amplitudes that are half its period apart (Phi12 is singular). If
+lost samples leave a gap of more than 0.9 of that time, the law predicts and does not correct.
 """
 
 import numpy as np
@@ -42,32 +42,32 @@ from .lqr import CONFIGURATION, WEIGHTS, dominant_mode, regulator
 
 
 class OutputFeedback(FastLaw):
-    """Optimal gain on an observer driven by amplitudes; see the module.
+    """Optimal gain on the estimate of an observer that uses amplitudes alone; see the module.
 
     Attributes
     ----------
     K_f : ndarray, shape (n, 2m)
         Gain on the *estimated* deviation.
     predicted, estimate : ndarray, shape (2m,)
-        Deviation before and after the correction by the present sample [m, rad, m/s, rad/s].
+        Estimated deviation before and after the correction by the present sample [m, rad, m/s, rad/s].
     """
 
     PARAMETERS = (
         *WEIGHTS,
         CONFIGURATION,
         parameter("observer_pole", 100.0, "1/s", 1.0, 1e5).described(
-            "How much faster than an open fast mode the estimate of it decays."
+            "How far left of an open fast pole the pole of its estimation error lies."
         ),
         parameter("period", 0.001, "s", 1e-5, 1.0).described(
-            "Sampling period that the design is checked for; the law follows the true one."
+            "Sampling period that the design is checked for; the law itself uses the true time between samples."
         ),
     )
 
     needs_rates = False
 
-    #: Designs are kept for this many different time steps; a new one takes about 0.1 ms.
+    #: Matrices are kept for this many different time steps; new ones take about 0.1 ms.
     KEPT = 64
-    #: Longest time step that allows a correction, over half a period of the fastest mode.
+    #: Longest time step that allows a correction, as a fraction of half a period of the fastest mode.
     MAX_PART = 0.9
     #: After this many samples in a row without a correction the law fails.
     BLIND = 20
@@ -87,7 +87,7 @@ class OutputFeedback(FastLaw):
         self.reset()
 
     def _check_period(self, q):
-        """Refuse a period with which the regulator, designed in continuous time, is unstable when sampled."""
+        """Refuse a period at which the regulator, designed in continuous time, is unstable when sampled."""
         period = self.parameters["period"]
         Phi, Gamma, _ = self._step(period)
         self._refuse_long(period)
@@ -112,7 +112,7 @@ class OutputFeedback(FastLaw):
             )
 
     def _step(self, dt):
-        """Phi, Gamma and L for the time step dt, L = 0 beyond the longest."""
+        """Phi, Gamma and L for the time step dt; L = 0 for a step that is too long for a correction."""
         found = self._steps.get(dt)
         if found is not None:
             return found
@@ -146,7 +146,7 @@ class OutputFeedback(FastLaw):
 
     def torque(self, z_f, q):
         m = self.model.n_modes
-        if self._L is None:  # first sample: from its amplitudes, at rest
+        if self._L is None:  # the first sample: start from its amplitudes, at rest
             self.predicted[:m] = z_f[:m]
             np.copyto(self.estimate, self.predicted)
         else:
@@ -159,13 +159,13 @@ class OutputFeedback(FastLaw):
         return None
 
     def state_space(self, dt):
-        r"""Discrete compensator with the state w, the prediction for the present sample.
+        r"""Discrete compensator; its state w is the prediction for the present sample.
 
         .. math::
             w' = (\Phi + \Gamma K_f)[(I - LC) w + L C z_f], \qquad u_f = K_f[(I - LC) w + L C z_f].
 
-        It starts from w = (amplitudes of the first sample, 0). The columns of B and D for the rates are zero. A period
-        `dt` that is too long for the fastest mode raises a `DesignError`.
+        The law starts from w = (amplitudes of the first sample, 0). The columns of B and D for the rates are zero. A
+        period `dt` that is too long for the fastest mode raises a `DesignError`.
         """
         self._refuse_long(dt)
         Phi, Gamma, L = self._step(dt)

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Fast control by pole placement: frequency and damping of every mode of (11) are prescribed.
+r"""Fast control by pole placement, with prescribed frequency and damping of every mode of (11).
 
 The boundary layer (11), :math:`\dot z_f = A_2 z_f + B_2 u_f`, taken at one joint configuration, has m modes with poles
 :math:`s_i` (a conjugate pair, or two real ones). :math:`u_f = K_f z_f` moves those of mode i to
 
 .. math:: p_i = \omega_i\,(-\zeta_i \pm j\sqrt{1-\zeta_i^2}), \qquad \omega_i = c_i\,|s_i|,
 
-with the damping ratio :math:`\zeta_i` and the factor :math:`c_i` of the open frequency. Modes are counted by
-ascending open frequency of the boundary layer, the joints free to move: not the links' own frequencies.
+with the damping ratio :math:`\zeta_i` and the factor :math:`c_i` of the open frequency. Modes are numbered by ascending
+open frequency of the boundary layer with the joints free to move; these are not the links' own frequencies.
 :math:`\zeta_i = 0` leaves the poles of a mode exactly as they are: K_f then feeds back only the modal coordinates of
-the others (left eigenvectors of A2). So a mode that no torque reaches can be left out.
+the other modes (left eigenvectors of A2). So a mode that no torque reaches can be left out.
 
-For one torque K_f is unique. For several, modes are moved one after the other, each by the combination of torques that
-reaches it best (modal control, Simon & Mitter 1968); feedback of a mode's own coordinates does not move the others'
-poles. A design with a pole that is not where it belongs is refused.
+With one torque, K_f is unique. With several, modes are moved one after the other, each by the combination of torques
+that reaches it best (modal control, Simon & Mitter 1968). Feedback of a mode's own coordinates does not move the poles
+of other modes. A design with a pole that misses its prescribed place is refused.
 """
 
 import numpy as np
@@ -36,20 +36,20 @@ class PolePlacement(FastLaw):
     frequencies : ndarray, shape (m,)
         Open natural frequencies of (11), ascending [rad/s].
     poles : ndarray of complex, shape (2m,)
-        Poles asked for, mode by mode [1/s].
+        Prescribed poles, mode by mode [1/s].
     """
 
     PARAMETERS = (
         parameter("damping", [0.5], "-", 0.0, 0.99, length="modes").described(
-            "Damping ratio of each closed fast mode, by ascending open frequency; 0.0 leaves the mode as it is."
+            "Closed-loop damping ratio of each fast mode, by ascending open-loop frequency; 0.0 leaves a mode as it is."
         ),
         parameter("frequency_scale", [1.0], "-", 0.1, 10.0, length="modes").described(
-            "Closed over open natural frequency of each fast mode."
+            "Ratio of closed-loop to open-loop natural frequency of each fast mode."
         ),
         CONFIGURATION,
     )
 
-    #: Largest relative distance of a closed pole from where it belongs.
+    #: Largest relative distance of a closed-loop pole from its prescribed place.
     TOLERANCE = 1e-6
     #: Normalised singular value below which no torque reaches a mode.
     UNREACHED = 1e-9
@@ -112,9 +112,9 @@ def modes_of(A2):
     Returns
     -------
     pairs : ndarray of complex, shape (m, 2)
-        A conjugate pair, or two real poles that follow each other in size.
+        A conjugate pair, or two real poles that are neighbours in magnitude.
     vectors : ndarray of complex, shape (2m, m)
-        Eigenvector of the first of the two.
+        Eigenvector of the first pole of each pair.
     """
     poles, vectors = np.linalg.eig(A2)
     up = np.flatnonzero(poles.imag > 0.0)
@@ -127,7 +127,7 @@ def modes_of(A2):
 
 
 def moving_gain(A, B, pair, polynomial):
-    """Gain that moves two poles of A to the roots of a polynomial and leaves the others.
+    """Gain that moves two poles of A to the roots of a polynomial and leaves the other poles.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def moving_gain(A, B, pair, polynomial):
         rows = left[[real[np.argmin(np.abs(poles[real] - p))] for p in pair]].real
         rows /= np.linalg.norm(rows @ B, axis=1)[:, None]
         first, second = rows @ B
-        # Between the two, to reach both: orthogonal ones would lose one or the other in a singular vector.
+        # A direction between the two reaches both. If they are orthogonal, a singular vector would miss one of them.
         direction = first + (second if first @ second >= 0.0 else -second)
         direction /= np.linalg.norm(direction)
     block = rows @ A @ np.linalg.pinv(rows)
@@ -166,7 +166,7 @@ def moving_gain(A, B, pair, polynomial):
 
 def reaches(A, B, poles):
     """How well the torques reach each pole: smallest normalised singular value of [A - s I, B], Hautus' test."""
-    # Balanced, and each pole on its own scale: else stiff modes hide what the input does to soft ones.
+    # A is balanced and scaled for each pole. Otherwise stiff modes hide the input's effect on soft ones.
     balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
     B = B / units[:, None]
     B = B / (np.linalg.norm(B) or 1.0)

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Optimal fast control, its gain scheduled over the workspace: the law of `lqr` as (11) changes with q.
+r"""Optimal fast control with a gain scheduled over the workspace: the law of `lqr` where (11) changes with q.
 
 Siciliano & Book (1986) solve (20) once, in the trajectory's end configuration. Here it is solved on a regular grid of
-joint configurations. On the control path the gain is interpolated multilinearly between them:
+joint configurations. The control path interpolates the gain multilinearly between them:
 
 .. math::
     u_f = K_f(q)\,z_f, \qquad
     K_f(q) = \sum_{c} \Big[\prod_j w_{j}(c, q_j)\Big] K_c, \qquad w_j \in \{1-t_j,\; t_j\},
 
-The sum runs over the 2^d corners c of the cell that contains q; t_j in [0, 1] is the place of q_j in the cell. Joints
-that do not change A2 and B2 are not in the grid: the first joint of a planar arm, the yaw of an arm on a column. They
-are found by evaluating (11). Beyond an end of the grid the gain is that of the end. The angle of a joint without
-position limits is first brought into +-pi.
+The sum runs over the 2^d corners c of the cell that contains q; t_j in [0, 1] is the place of q_j in the cell. The grid
+leaves out joints that do not change A2 and B2, such as the first joint of a planar arm or the yaw of an arm on a
+column. Evaluations of (11) find them. Beyond an end of the grid, the gain is that of the end. The angle of a joint
+without position limits is first wrapped to +-pi.
 
 The closed boundary layer A2(q) + B2(q) K_f(q) is checked in the middle of every cell, where the interpolation error is
-largest, and at random configurations. Every pole must lie left of -alpha/2. The check takes q as constant: it changes
-slowly beside the fast states of (11).
+largest, and at random configurations. Every pole must lie left of -alpha/2. The check treats q as constant, because q
+changes slowly compared with the fast states of (11).
 """
 
 import itertools
@@ -36,20 +36,20 @@ class GainTable:
     Parameters
     ----------
     joints : sequence of int
-        Joints that span the grid, d of them; the last one's index runs fastest.
+        The d joints that span the grid; the index of the last one runs fastest.
     low, high : ndarray, shape (d,)
         Ends of the grid [rad].
     points : int
         Points per joint.
     turns : ndarray of bool, shape (d,)
-        Joints without position limits: their angle is brought into +-pi first.
+        True for joints without position limits, whose angle is first wrapped to +-pi.
     matrices : ndarray, shape (points**d, rows, columns)
     """
 
     def __init__(self, joints, low, high, points, turns, matrices):
         strides = points ** np.arange(len(joints) - 1, -1, -1)
         scale = (points - 1) / (high - low)
-        # Plain numbers: cheaper one by one than arrays of this size.
+        # Plain numbers are cheaper than arrays of this size.
         self._axes = [
             (int(j), float(a), float(s), int(stride), bool(turn))
             for j, a, s, stride, turn in zip(joints, low, scale, strides, turns, strict=True)
@@ -84,7 +84,7 @@ class ScheduledLqr(FastLaw):
     scheduled : ndarray of int
         Joints that the gain depends on.
     nodes : ndarray, shape (N, n)
-        Joint configurations of the grid [rad]; the other joints in the middle of their range.
+        Joint configurations of the grid [rad]; the other joints are in the middle of their range.
     gains : ndarray, shape (N, n, 2m)
         K_f at the nodes.
     K_f : ndarray, shape (n, 2m)
@@ -96,19 +96,19 @@ class ScheduledLqr(FastLaw):
     PARAMETERS = (
         *WEIGHTS,
         parameter("grid", 5, "-", 2, 41).described(
-            "Designs per joint that changes the boundary layer (11); between them the gain is interpolated."
+            "Designs per joint that changes the boundary layer (11); the gain is interpolated between them."
         ),
         parameter("low", [0.0], "rad", -100.0, 100.0, length="joints").described(
-            "Lower end of the scheduled range; 0.0 here and in high: limits.position, -pi where there is none."
+            "Lower end of the scheduled range; with 0.0 here and in high: limits.position, or -pi if there is none."
         ),
         parameter("high", [0.0], "rad", -100.0, 100.0, length="joints").described(
-            "Upper end of the scheduled range; 0.0 here and in low: limits.position, pi where there is none."
+            "Upper end of the scheduled range; with 0.0 here and in low: limits.position, or pi if there is none."
         ),
     )
 
-    #: This many designs take some minutes for an arm of ten modes.
+    #: For an arm of ten modes, this many designs take some minutes.
     MAX_DESIGNS = 20000
-    #: At most this many random configurations are checked beside the middles of the cells.
+    #: At most this many random configurations are checked in addition to the middles of the cells.
     CHECKED = 1000
     #: Relative change of A2 or B2 below which a joint does not matter.
     NEGLIGIBLE = 1e-9
@@ -127,7 +127,7 @@ class ScheduledLqr(FastLaw):
         self.K_f = self.gain(self.configuration)
 
     def _set_range(self):
-        """Range of each joint, from the parameters or from the arm file's limits."""
+        """Set the range of each joint, from the parameters or from the arm file's limits."""
         low, high = np.array(self.parameters["low"]), np.array(self.parameters["high"])
         default = (low == 0.0) & (high == 0.0)
         limits = self.model.arm.position_limits
@@ -144,7 +144,7 @@ class ScheduledLqr(FastLaw):
             )
 
     def _find_joints(self):
-        """Joints that change A2 or B2, each turned alone from a few configurations."""
+        """Joints that change A2 or B2 when turned alone from a few configurations."""
         n = self.model.n_joints
         if not self.model.n_modes:
             return np.array([], int)
@@ -210,7 +210,7 @@ class ScheduledLqr(FastLaw):
 
     @property
     def configuration(self):
-        """In the middle of the range."""
+        """Joint configuration in the middle of the range, shape (n,) [rad]."""
         return 0.5 * (self.low + self.high)
 
     def gain(self, q):

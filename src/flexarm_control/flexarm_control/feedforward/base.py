@@ -19,10 +19,10 @@ class Settings:
 
 
 class Feedforward(Component, ABC):
-    """A motion of the whole arm, bending included, near the reference, and the torque that makes it.
+    """A motion of the whole arm, bending included, near the reference, and the torque that produces it.
 
-    Registered by name in the entry-point group ``flexarm.feedforwards``. The composite control holds the arm
-    to it: its slow law tracks the joints of this motion, its fast law the deflections.
+    A feed-forward is registered by name in the entry-point group ``flexarm.feedforwards``. The composite control holds
+    the arm to the motion: its slow law tracks the joints of this motion, its fast law the deflections.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ class Feedforward(Component, ABC):
     amplitude, rate : ndarray, shape (m,)
         Its deflections [m, rad] and their rates.
     torque : ndarray, shape (n,)
-        What makes it [N m].
+        Torque that produces the motion [N m].
     limit : ndarray, shape (n,)
         Active torque limit [N m]; infinite: none.
     """
 
     #: Whether `prepare` has anything to do.
     plans = False
-    #: Whether the motion was put elsewhere at the present sample, in place of moving on.
+    #: Whether the motion was set to another state at the present sample, instead of moving on.
     placed = False
 
     def __init__(self, model, manifold, settings):
@@ -56,7 +56,7 @@ class Feedforward(Component, ABC):
         self.limit = np.full(n, np.inf)
 
     def near(self, offset):
-        """State (position, velocity, acceleration), (3, n), at an offset [s]: continued with this acceleration."""
+        """State (position, velocity, acceleration), (3, n), at an offset [s], with constant acceleration."""
         out = np.empty((3, self.position.size))
         out[0] = self.position + offset * (self.velocity + 0.5 * offset * self.acceleration)
         out[1] = self.velocity + offset * self.acceleration
@@ -67,9 +67,10 @@ class Feedforward(Component, ABC):
         """Follow `plan`, the result of `prepare` or None, as soon as the reference follows its trajectory."""
 
     def prepare(self, trajectory, start):
-        """Design work for a trajectory, off the control path; None where there is none to do.
+        """Do the design work for a trajectory, off the control path; returns None if there is none to do.
 
-        It will begin from `start`, the state of rest (position, velocity, acceleration) of the reference, (3, n).
+        The trajectory will begin from `start`, the reference's state of rest (position, velocity, acceleration),
+        (3, n).
         """
         found = self.prepare_next(trajectory, start, None)
         while found is not None and found.left:
@@ -77,19 +78,19 @@ class Feedforward(Component, ABC):
         return found
 
     def prepare_next(self, trajectory, start, found):
-        """The next part of `prepare`, after what was `found` so far, None at first; see its `left`."""
+        """Do the next part of `prepare` after what was `found` so far (None at first); `left` names further parts."""
         return None
 
     @abstractmethod
     def update(self, reference, dt):
-        """Move on to the present sample; the control path.
+        """Move on to the present sample; runs on the control path.
 
         Parameters
         ----------
         reference : ReferenceGenerator
             At the present stamp.
         dt : float
-            Time since the last sample [s]; 0: the first one.
+            Time since the last sample [s]; 0: the first sample.
         """
 
     def look_ahead(self, reference, dt):
@@ -98,6 +99,6 @@ class Feedforward(Component, ABC):
         Returns
         -------
         position, velocity, acceleration : ndarray, shape (n,)
-            Of the motion then, as far as can be foreseen; or None.
+            Expected motion at that sample; or None.
         """
         return None

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Feed-forward from a model that runs along: the nominal arm, simulated under a regulator of its own.
+r"""Feed-forward from a model that runs in parallel: the nominal arm, simulated under its own regulator.
 
 The slow manifold along the reference, :math:`s_{ref} = (q_{ref}, \bar\delta, \dot q_{ref}, \dot{\bar\delta})` with
-its torque u_ref, is not quite a motion of the arm: its expansion in mu is cut off, and the rates of the deflections
+its torque u_ref, is not quite a motion of the arm: its expansion in mu is truncated, and the rates of the deflections
 jump wherever the reference's jerk does. A fast control that pulls the real arm over such a jump kicks the joints, and
 they return no faster than the slow poles. Therefore the nominal arm is simulated here, with the control model, under
 
@@ -11,28 +11,30 @@ they return no faster than the slow poles. Therefore the nominal arm is simulate
 where K_s is the optimal regulator of the *whole* arm, joints and bending, with prescribed degree of stability.
 Only the reference acts on the simulated arm, so that neither noise nor delay nor an unknown payload limits the gains.
 The regulator brings joints and bending to the reference in about a period of the slowest mode. (s, u_s) is a motion of
-the nominal arm, sample by sample, within its torque limits; the composite control holds the real arm to it with the
+the nominal arm, sample by sample, within its torque limits. The composite control holds the real arm to it with the
 gains that the real arm allows.
 
 The regulator minimises :math:`\int e^{2\alpha t}(e^T Q e + u^T u)\,dt` of the joint errors e alone, with
 :math:`Q^{1/2} = \mathrm{diag}(M_{11})\,\omega_1^2` and :math:`\alpha = 0.3\,\omega_1`. omega_1 is the lowest bending
 frequency with the joints locked: the joints are held about as stiffly as the softest mode can follow. A mode that no
-torque reaches, as the vertical bending of an arm that only yaws, is left out. If the arm's
-inertia changes with its joints, gains are designed along each trajectory when it is received, and interpolated: about
-the arm as it moves there (`moving_plant`), since one that is bent by its acceleration answers otherwise than one at
-rest; for a stop on the way also about the arm at rest. A trajectory that arrives while the arm moves is then followed
-on the slow manifold alone.
+torque reaches, such as the vertical bending of an arm that only yaws, is left out.
 
-Coulomb friction would hold the simulated arm beside the reference, where no integral moves it on. So its torque
-has, in the place of the friction on the reference, which u_ref has, that of its own speeds, sample by sample: friction
-takes just that from the torque, and the arm moves as one without.
+If the arm's inertia changes with its joints, gains are designed along each trajectory when it is received, and
+interpolated. They are designed about the moving arm (`moving_plant`), because an arm bent by its acceleration responds
+differently from one at rest; for a stop on the way also about the arm at rest. A trajectory that arrives while such an
+arm moves is followed on the slow manifold alone.
 
-At rest s_ref and u_ref are where the control model rests under its own weight. The manifold leaves out products of
-deflections and weight, so that the simulated arm would hang beside the reference.
+Coulomb friction would hold the simulated arm beside the reference, where no integral moves it on. So the friction on
+the reference, which is part of u_ref, is replaced by the friction at the simulated arm's own speeds, sample by sample.
+Friction takes just that from the torque, and the arm moves as if it had none.
+
+At rest, s_ref and u_ref are those at which the control model rests under its own weight. The manifold neglects products
+of deflections and weight; on it, the simulated arm would hang beside the reference.
 
 The manifold jumps wherever the reference's jerk or snap does: between the polynomials of a trajectory, at its start and
-end. The regulator's torque must not. So the jump is added to what the regulator tracks, and fades (module `fading`):
-J_i is what the polynomial before t_i, continued, gives at t_i, less what the one after it gives; likewise for u_ref.
+end. The regulator's torque must not jump. So the jump is added to what the regulator tracks, and fades (module
+`fading`). J_i is the value of the polynomial before t_i, continued to t_i, minus that of the one after it; likewise for
+u_ref.
 """
 
 from dataclasses import dataclass, replace
@@ -56,36 +58,36 @@ from ..trajectory.path import Path, around
 from ..trajectory.values import SECOND
 from .base import Feedforward
 
-#: Prescribed degree of stability of the regulator, over the lowest bending frequency.
+#: Ratio of the regulator's prescribed degree of stability to the lowest bending frequency.
 DECAY = 0.3
-#: Of the simulation: of eight stages more than RK4 has, and steps five times as long.
+#: Integration method of the simulation: eight stages more than RK4, and steps five times as long.
 METHOD = "dop853"
 #: Beyond this joint error the simulated arm starts again on the reference [rad].
 LOST = 1.0
-#: Largest turn of a joint [rad], and change of what bends the arm [-], between two designs along a trajectory.
+#: Largest turn of a joint [rad], and largest change of the bending load [-], between two designs along a trajectory.
 APART, BENT = 0.12, 0.008
-#: Times of a trajectory at which one may be.
+#: Number of times of a trajectory at which a design may be made.
 GRID = 400
 #: Relative change of the plant with the joints below which one gain serves everywhere.
 NEGLIGIBLE = 1e-6
-#: Times between two of them at which the interpolation is checked; where it does not hold, the interval is halved while
-#: a joint turns by more than this in it [rad].
+#: Number of times between two designs at which the interpolated gain is checked. If it does not hold the arm, the
+#: interval is halved, as long as a joint turns by more than this in it [rad].
 CHECKS, NEAREST = 3, APART / 8.0
-#: Parts of a preparation, each of use without the next.
+#: Parts of a preparation, each useful without the next.
 RESTING, MOVING, PLAN = "regulators of the arm at rest", "regulators of the moving arm", "plan"
 PARTS = RESTING, MOVING, PLAN
-#: When the reference rests, and every coordinate is this close to it, the simulated arm is put there.
+#: When the reference rests, and every coordinate is this close to it, the simulated arm is set to the reference.
 THERE = 1e-9
-#: The reference must begin within this of where a plan does [rad], [rad/s], [rad/s^2].
+#: The reference must begin this close to the start of a plan [rad], [rad/s], [rad/s^2].
 SAME_START = 1e-6
 
 
 def regulator(model, q, period, velocity=None, acceleration=None):
     """Optimal gain K_s of the whole arm in a configuration, shape (n, 2 (n + m)); see the module.
 
-    With a `velocity` and an `acceleration` (n,) of its joints it moves; without, it rests. Where the torque is held for
-    a `period` [s] that is too long for the gain of continuous time, as with modes near the sampling frequency, it is
-    the optimal gain of sampled time.
+    With a `velocity` and an `acceleration` (n,) of its joints the arm moves; without, it rests. The gain is that of
+    continuous time. If the torque is held for a `period` [s] that is too long for it, as with modes near the sampling
+    frequency, the gain is the optimal one of sampled time.
     """
     n, omega = model.n_joints, lowest(model, q)
     A, B = _plant(model, q, velocity, acceleration)
@@ -121,9 +123,9 @@ def _plant(model, q, velocity=None, acceleration=None):
 def reached(A, B):
     """Orthonormal directions of the state without the modes that no torque reaches, shape (N, k).
 
-    The left eigenvectors W of those modes, :math:`W A = T W` with :math:`W B = 0`, move by themselves whatever the
-    torque is; V spans the rest, :math:`W V = 0`. A gain K of (V'AV, V'B) gives A - B K V' the poles of T and of
-    V'AV - V'B K.
+    The left eigenvectors W of those modes, :math:`W A = T W` with :math:`W B = 0`, give coordinates that move by
+    themselves, whatever the torque is. V spans the rest, :math:`W V = 0`. A gain K of (V'AV, V'B) gives A - B K V' the
+    poles of T and of V'AV - V'B K.
     """
     poles, vectors = np.linalg.eig(A.T)
     bending = np.flatnonzero(poles.imag > 0.0)
@@ -135,12 +137,12 @@ def reached(A, B):
 
 
 class Gains:
-    """Regulators along a trajectory, linear in time between them.
+    """Regulators along a trajectory, linearly interpolated in time.
 
     Parameters
     ----------
     times : ndarray, shape (k,)
-        Since the trajectory's start [s].
+        Times since the trajectory's start [s].
     gains : ndarray, shape (k, n, 2 (n + m))
     """
 
@@ -148,7 +150,7 @@ class Gains:
         self.times, self.gains = times, gains
 
     def at(self, elapsed):
-        """Gain at a time since the start [s]; held beyond either end."""
+        """Gain at a time since the start [s]; constant beyond either end."""
         out = np.empty(self.gains.shape[1:])
         kernels.compiled().between(self.times, self.gains, elapsed, out)
         return out
@@ -167,7 +169,7 @@ class Preparation:
     left: tuple = ()  # parts that are still to come
 
     def at(self, elapsed, path, stamp_ns):
-        """Gain at a time since the start [s]; on a path that is slowed down, what bends the arm falls as s'^2."""
+        """Gain at a time since the start [s]; on a path that is slowed down, the bending load falls as s'^2."""
         K, moves = self.gains.at(elapsed), min(path.pace(stamp_ns) ** 2, 1.0)
         if moves < 1.0:
             K *= moves
@@ -187,15 +189,15 @@ def path_of(trajectory, start):
 def gains_along(model, path, period, moving=True):
     """`Gains` along a path for samples of a `period` [s], checked on the path at `CHECKS` times of each interval.
 
-    They are for the arm as it moves there, or, not `moving`, for one that rests there; at both ends it rests. A motion
-    bends the arm by its accelerations and squared speeds over the square of the lowest frequency with the joints
-    locked. An interval whose interpolated gain does not hold the arm is halved, while a joint turns by more than
-    `NEAREST` in it.
+    They are for the moving arm or, if not `moving`, for an arm that rests on the path; at both ends the arm rests. A
+    motion bends the arm by its accelerations and squared speeds, divided by the square of the lowest frequency with the
+    joints locked. An interval whose interpolated gain does not hold the arm is halved, as long as a joint turns by more
+    than `NEAREST` in it.
 
     Raises
     ------
     DesignError
-        Where a configuration has no regulator, or the gain of so short an interval does not hold.
+        If a configuration has no regulator, or the gain does not hold the arm in an interval as short as that.
     """
     grid = np.linspace(0.0, path.duration_ns / SECOND, GRID)
     states = np.empty((grid.size, 3, model.n_joints))
@@ -231,17 +233,17 @@ def gains_along(model, path, period, moving=True):
 
 
 def _length(points):
-    """Length of a way through points (k, n) up to each of them, by the coordinate that changes most, (k,)."""
+    """Length of the path through points (k, n) up to each of them, by the coordinate that changes most, (k,)."""
     return np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points, axis=0)).max(axis=1))])
 
 
 def _regulator_of(model, state, period):
-    """`regulator` of an arm in a state (position, velocity, acceleration), (3, n), or at rest in a (1, n) position."""
+    """`regulator` for an arm in a state (position, velocity, acceleration), (3, n), or at rest in a (1, n) position."""
     return regulator(model, state[0], period, *state[1:])
 
 
 def _hold_between(model, states, gains, period):
-    """Whether the gains of both ends, linear in time, hold the sampled arm in the states between, (k, 3 or 1, n)."""
+    """Whether gains interpolated between both ends hold the sampled arm in the states between, (k, 3 or 1, n)."""
     steps = len(states) - 1
     for k in np.unique(np.linspace(0, steps, CHECKS + 2).astype(int))[1:-1]:
         K = gains[0] + k / steps * (gains[1] - gains[0])
@@ -252,7 +254,7 @@ def _hold_between(model, states, gains, period):
 
 
 class _Source(NamedTuple):
-    """What the motion that the regulator tracks is taken from at a sample, and that motion."""
+    """The source of the motion that the regulator tracks at a sample, and that motion."""
 
     path: object  # None: a hold
     piece: object  # of the path
@@ -267,24 +269,24 @@ class _Source(NamedTuple):
         return self.path is None or self.piece == Path.END
 
     def goes_on(self, other):
-        """Whether one formula gave this and the other's motion."""
+        """Whether the same formula gave this motion and the other's."""
         return self[:3] == other[:3]
 
 
 class _Run:
-    """The simulated arm, and the regulator's memory.
+    """The simulated arm and the regulator's memory.
 
     Attributes
     ----------
     state, torque : ndarray, shapes (2 (n + m),) and (n,)
     driven : ndarray, shape (n,)
-        The torque without its Coulomb friction: what moves it [N m].
+        The torque without Coulomb friction, which moves the arm [N m].
     fading : Fading
-        Of (state, torque).
+        Jumps of (state, torque).
     source : _Source or None
-        Of the last sample.
+        Source at the last sample.
     gained, placed : bool
-        Whether there was a gain at the last sample, and whether the arm was put elsewhere then.
+        Whether there was a gain at the last sample, and whether the arm was set to another state then.
     """
 
     def __init__(self, size, n, rate):
@@ -293,14 +295,14 @@ class _Run:
         self.gained = self.placed = False
 
     def take(self, other):
-        """Go on as the other one would."""
+        """Go on from the state of the other run."""
         self.state[:], self.torque[:], self.driven[:] = other.state, other.torque, other.driven
         self.fading.take(other.fading)
         self.source, self.gained, self.placed = other.source, other.gained, other.placed
 
 
 class At:
-    """The reference on a path's polynomial of a stamp, at an offset from it; the reference itself does not change."""
+    """The reference on a path's polynomial at a stamp, at an offset from the stamp; the reference does not change."""
 
     def __init__(self, path, stamp_ns, offset=0.0):
         self.path, self.stamp_ns, self._offset = path, stamp_ns, offset
@@ -315,12 +317,12 @@ class At:
         return state
 
     def around(self, step, out):
-        """Fill `out` (p, 3, n) with states at offsets `step` [s] apart; the middle one is from there, as of `near`."""
+        """Fill `out` (p, 3, n) with states at offsets `step` [s] apart from there, the middle one as of `near`."""
         around(self.path, self.stamp_ns, self._offset, step, out)
 
 
 class _Ahead(At):
-    """The reference at a coming stamp, and the result for it."""
+    """The reference at the next stamp, and the result for it."""
 
     def __init__(self, reference, dt, limit):
         super().__init__(reference.path, reference.stamp_ns + round(dt * SECOND))
@@ -328,7 +330,7 @@ class _Ahead(At):
         self.run = None
 
     def foresaw(self, reference, dt):
-        """Whether this is the sample that has come."""
+        """Whether the sample that has arrived is the foreseen one."""
         path = reference.path
         now = (path, path and path.start_ns, reference.stamp_ns, dt)
         return now == (self.path, self.start_ns, self.stamp_ns, self.dt)
@@ -355,13 +357,13 @@ class ModelFeedforward(Feedforward):
         self._prepared, self._first = None, True
         self._ahead = None  # the result of `look_ahead`
         self._held = None  # position, and the result of `wanted` there, while the reference rests
-        # A state that a path begins from, and whether the preparation's is that.
+        # The start state of a path, and whether the preparation starts from the same.
         self._begins = None, False
 
     def _make_stepper(self):
         n, m = self.model.n_joints, self.model.n_modes
         self._advance = self.model.stepper(METHODS[METHOD])
-        # Compiled code is loaded at its first call: not on the control path.
+        # Compiled code is loaded at its first call, which must not be on the control path.
         self._advance(np.zeros(2 * (n + m)), np.zeros(n), 0.0, 1)
         Gains(np.zeros(1), np.zeros((1, n, 2 * (n + m)))).at(0.0)
 
@@ -410,7 +412,7 @@ class ModelFeedforward(Feedforward):
         return self._run.placed
 
     def prepare_next(self, trajectory, start, found):
-        # A model of its own: the loop goes on with this one meanwhile.
+        # Works on a copy, because the loop goes on with the original model meanwhile.
         model, path = copy(self.model), path_of(trajectory, start)
         part, *left = PARTS if found is None else found.left
         found = Preparation(start, None) if found is None else found
@@ -423,7 +425,7 @@ class ModelFeedforward(Feedforward):
                 found.gains = gains_along(model, path, self.settings.period, part == MOVING)
                 if found.at_rest is None:  # in a stop, those of the moving arm are better than none
                     found.at_rest = found.gains
-        except DesignError as error:  # what there is so far is better than nothing
+        except DesignError as error:  # the parts so far are better than nothing
             found.note = "; ".join(filter(None, (found.note, str(error))))
         return found
 
@@ -445,7 +447,7 @@ class ModelFeedforward(Feedforward):
             before = other._run.source
             if self._other_payload(other) and before is not None and before.rests:
                 self._first = (
-                    True  # bent by its own weight at once: the torque that changes fades in `law`
+                    True  # bent by its own weight at once; `law` lets the change of torque fade
                 )
             else:
                 self._run.take(other._run)
@@ -454,14 +456,14 @@ class ModelFeedforward(Feedforward):
         return self.model.payload_scale != other.model.payload_scale
 
     def _preparation(self, reference):
-        """What was designed for the active trajectory, and the time since its start; None, 0 without."""
+        """The preparation of the active trajectory and the time since its start; None, 0 if there is none."""
         prepared, path = self._prepared, reference.path
         if prepared is None or path is None:
             return None, 0.0
         followed = path.followed
         if followed.trajectory_id != prepared.trajectory_id:
             return None, 0.0
-        begin = followed.begin_state  # a path that begins anew has another array
+        begin = followed.begin_state  # a path that starts again has another array
         if self._begins[0] is not begin:
             self._begins = begin, np.abs(begin - prepared.start).max() <= SAME_START
         if not self._begins[1]:
@@ -475,7 +477,7 @@ class ModelFeedforward(Feedforward):
         """State and torque of a plan, `offset` [s] from a stamp."""
 
     def _source(self, reference, prepared):
-        """What the regulator holds the simulated arm to, and where it is from."""
+        """The motion that the regulator holds the simulated arm to, with its source."""
         path, stamp = reference.path, reference.stamp_ns
         piece = Path.END if path is None else path.piece(stamp)
         plan = self._planned(prepared, path, stamp)
@@ -498,7 +500,7 @@ class ModelFeedforward(Feedforward):
         return np.concatenate([reference.position, delta, reference.velocity, rate]), torque
 
     def _at_rest(self, position):
-        """The same where the reference rests: exactly, as the control model bends under its own weight."""
+        """State and torque where the reference rests, exactly as the control model bends under its own weight."""
         model, none = self.model, np.zeros(self.model.n_joints)
         state, torque = self._on_manifold(at_rest(position))
         if not any(model.arm.gravity) or not model.n_modes:
@@ -550,12 +552,12 @@ class ModelFeedforward(Feedforward):
             if not source.goes_on(before):
                 now = np.concatenate([source.state, source.torque])
                 fading.jump(self._continued(before, dt) - now)
-        if K is None and run.gained:  # what the regulator had not brought in is a jump, too
+        if K is None and run.gained:  # the error that the regulator had left is a jump, too
             wanted = np.concatenate([source.state, source.torque]) + fading.left
             fading.jump(np.concatenate([run.state, run.torque]) - wanted)
         run.source, run.gained = source, K is not None
         compiled, error, left = kernels.compiled(), self._error, fading.left
-        # The largest error of the joints, and of all.
+        # The largest error of the joints, and of all coordinates.
         joints, largest = compiled.off(source.state, left, run.state, error)
         first, self._first = self._first, False
         run.placed = first or not joints < LOST  # NaN is lost, too
@@ -569,7 +571,7 @@ class ModelFeedforward(Feedforward):
         )  # fmt: skip
 
     def _move(self, run, dt):
-        """Advance a run's simulated arm, under its present torque."""
+        """Advance a run's simulated arm under its present torque."""
         count = max(1, round(dt / self.settings.period)) * self._substeps
         self._advance(run.state, run.driven, dt / count, count, self._sliding)
 

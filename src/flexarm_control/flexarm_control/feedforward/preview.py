@@ -1,38 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Feed-forward with preview: a motion that bends the arm and leaves it straight at its end.
+r"""Feed-forward with preview: plans a motion that bends the arm and leaves it at rest at its end.
 
 A trajectory is known as a whole when it is received, and the joints need not follow it exactly. A small shift p of the
-reference, zero with its rates at both ends, is chosen so that the bending under
+reference, which is zero with its rates at both ends, is chosen so that the bending under
 :math:`\ddot q = \ddot q_{ref} + \ddot p` is at rest when the trajectory ends. With :math:`p = \sum_j c_j N_j(t)`
 (quintic B-splines) the modal rows of (2) along the reference,
 
 .. math:: M_{22}\ddot\delta + C_2\dot\delta + K_2\delta = -M_{21}(\ddot q_{ref} + \ddot p) - f_2,
 
-are linear in c to first order. The shift of least mean square,
+are linear in c to first order. The shift with the least mean square,
 
 .. math::
     \min_c \int |p|^2 + \epsilon\,|\ddot p|^2/\omega_1^4\,dt \quad\text{s.t.}\quad
     \delta(T) = \bar\delta,\; \dot\delta(T) = 0,
 
-solves one linear system. If its torque exceeds the limit, what is beyond 0.95 of it is penalised where it is, round by
-round. (The shift with the smallest maximum within the limit, a linear programme, ends sooner, but turns steeply from
-bound to bound: what it excites beside the plan was lost on one random arm.) The full equations are then
-integrated along the solution, and what is left at the end is solved for again: with the derivatives there were, as long
-as that makes the next change much smaller. A mode that the shift does not move is left out. All of this happens when
-the trajectory is received, off the control path. `model` follows the motion in place of the slow manifold: the
+solves one linear system. If its torque exceeds the limit, the torque beyond 0.95 of it is penalised where it occurs,
+round by round. (The shift with the smallest maximum within the limit, a linear programme, ends sooner, but turns
+steeply from bound to bound. What this excites beside the plan was lost on one random arm.) The full equations are then
+integrated along the solution, and the remaining bending at the end is solved for again. This uses the same derivatives
+as long as they make the next change much smaller. A mode that the shift does not move is left out. All of this happens
+when the trajectory is received, off the control path. `model` follows the motion in place of the slow manifold: the
 regulator of its simulated arm removes the remaining error.
 
-Where no shift is found within the torque, and the feed-forward knows more of the arm than the control, that of the
-arm as the control knows it is taken; where it has none, either, what `model` makes of it. The manifold, which
-the torque may not give, remains where there is nothing more to know. The reason is in `Preparation.note`.
+If no shift is found within the torque limit, and the feed-forward knows more of the arm than the control, the plan of
+the control's own model is taken. If that has none either, the motion that `model` makes with that model is taken. If
+the feed-forward knows no more than the control, the manifold remains, for which the torque may not suffice. The reason
+is in `Preparation.note`.
 
 In a stop, the plan can't be followed. Its bending beside the slow manifold is a vibration, which goes on in its own
-time and ends with the plan; the regulator damps it as the joints slow down. So with the manifold's motion s_ref along
-the stop, and s_path along the trajectory, the simulated arm is held to
+time and ends with the plan. The regulator damps it as the joints slow down. Let s_ref be the manifold's motion along
+the stop, and s_path that along the trajectory. The simulated arm is then held to
 
 .. math:: s_{ref}(t) + \dot s(t)\,\bigl(s_{plan}(t) - s_{path}(t)\bigr),
 
-where :math:`\dot s`, from 1 to 0, is the stop's time law (module `trajectory.path`); likewise the torque.
+where :math:`\dot s`, from 1 to 0, is the stop's time law (module `trajectory.path`); the torque changes likewise.
 """
 
 from dataclasses import dataclass, replace
@@ -51,44 +52,44 @@ from .model import At, ModelFeedforward, Preparation, gains_along
 
 #: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
-#: Least and largest number of free coefficients per joint.
+#: Minimum and maximum number of free coefficients per joint.
 MIN_COUNT, MAX_COUNT = 24, 160
 #: Modes slower than this phase per knot are brought to rest; faster ones follow without being excited [rad].
 FASTEST = 3.0
-#: Rounds at most, and change of the shift after which there is no other one [rad]. The equations are linearised anew
-#: where a change is more than this part of the one before it.
+#: Maximum number of rounds, and change of the shift after which there is no further round [rad]. The equations are
+#: linearised again if a change is more than this fraction of the one before it.
 ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
-#: A plan whose last change was more than this has not been found [rad], nor will be, where after so many rounds it is
-#: still more than `SLOW` of the first one. What is left of a smaller one is taken up by the regulator.
+#: A plan is not found if its last change was more than this [rad]. The search ends early if the change is still more
+#: than `SLOW` of the first one after this many rounds. The regulator takes up what a smaller change leaves.
 FOUND, HOPELESS = 0.02, 5
-#: Of the torque limit, the part that a plan takes where it would take more; what is beyond is penalised by a weight, in
-#: so many rounds at most.
+#: Fraction of the torque limit that a plan aims at where it would take more, weight of the penalty beyond it, and
+#: maximum number of rounds with a penalty.
 RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
 #: Number of times at which shift and torque are bounded.
 GRID = 100
-#: Number of times at which the equations are linearised, at first and anew, and the step of the differences [rad],
-#: [rad/s]. With no more than at first the rounds hardly converge where torque binds: two random arms seemed to have no
-#: plan.
+#: Number of times at which the equations are linearised, at first and again, and the step of the finite differences
+#: [rad], [rad/s]. If the first number is used throughout, the rounds hardly converge where the torque limit is active:
+#: two random arms seemed to have no plan.
 KNOTS, SMALL = (80, 400), 1e-6
-#: Weight of the shift's acceleration, over the square of the lowest bending frequency, beside the shift.
+#: Weight of the shift's acceleration, over the square of the lowest bending frequency, relative to the shift.
 SMOOTHNESS = 0.01
-#: Phase of the fastest mode per step at which Runge-Kutta's fourth order is still stable, with a margin; and where the
-#: arm's own motion makes that mode faster, and the first one too much [rad].
+#: Phase of the fastest mode per step at which the fourth-order Runge-Kutta method is still stable, with a margin; and a
+#: smaller phase for motions that make that mode faster, so that the first is too large [rad].
 STABLE, STABLER = 1.5, 0.75
 #: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
-#: A mode on which the shift has less force than this of that on others is left as it is: where slopes are finite, one
-#: across the joints' axes has some [-].
+#: A mode is left as it is if the shift's force on it is less than this fraction of that on others [-]. With finite
+#: slopes, the shift has some force on a mode across the joints' axes.
 UNMOVED = 1e-2
-#: Length of the plan's steps over that of those grid steps, at most [-].
+#: Maximum ratio of the plan's steps to those grid steps [-].
 PLANNED = 0.25
-#: A longer motion is not planned [samples].
+#: A motion of more steps is not planned.
 MAX_STEPS = 40_000
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A motion of the whole arm from rest to rest, by the time since its start."""
+    """A motion of the whole arm from rest to rest, as a function of the time since its start."""
 
     duration: float  # [s]
     motion: CubicHermiteSpline  # (q, delta, qd, delta_d)
@@ -104,7 +105,7 @@ class Plan:
         return out
 
     def among(self, model, fuller):
-        """The plan of a `model` as one of a `fuller` one, whose further modes rest."""
+        """The plan of a `model` as a plan of a `fuller` model, whose further modes rest."""
         n, names = model.n_joints, fuller.mode_names
         here = np.r_[np.arange(n), [n + names.index(name) for name in model.mode_names]]
         here = np.r_[here, here + n + len(names)]
@@ -141,7 +142,7 @@ class Preview(ModelFeedforward):
             except DesignError:
                 if known is None:
                     raise
-            # That of the arm as the control knows it is near one, and within the torque, as the manifold may not be.
+            # The plan of the control's own model is near one, and within the torque limit; the manifold may not be.
             known = copy(known)
             try:
                 plan = self._solved(known, path, start)
@@ -150,7 +151,7 @@ class Preview(ModelFeedforward):
             return plan.among(known, model)
 
     def _solved(self, model, path, start):
-        """The `Plan` of a model; with shorter steps where it goes beyond all bounds."""
+        """The `Plan` of a model; with shorter steps if the motion grows without bound."""
         planner = _Planner(model, path, start, self.limit)
         try:
             return planner.solve()
@@ -161,7 +162,7 @@ class Preview(ModelFeedforward):
             return finer.solve()
 
     def _regulated(self, known, path, start):
-        """What `model` makes of a path with the arm as the control knows it, as a `Plan`: within the torque, too."""
+        """What `model` makes of a path with the control's own model, as a `Plan` within the torque limit, too."""
         settings, period = replace(self.settings, known=None), self.settings.period
         forward = ModelFeedforward(known, self.manifold.of(known), settings)
         forward.limit = self.limit
@@ -187,7 +188,7 @@ class Preview(ModelFeedforward):
     def _along(self, plan, path, stamp_ns, offset):
         way = path.followed
         elapsed = (stamp_ns - way.start_ns) / SECOND + offset
-        # The torque is held over the coming period: that of its middle.
+        # The torque is held over the coming period, so that of its middle is taken.
         state, torque = plan.state_at(elapsed), plan.torque_at(elapsed + 0.5 * self.settings.period)
         if path is way:
             return state, torque
@@ -197,7 +198,7 @@ class Preview(ModelFeedforward):
 
 
 class Unbounded(DesignError):
-    """A motion that has no finite numbers."""
+    """A motion whose numbers are not finite."""
 
 
 def _finite(*arrays):
@@ -210,7 +211,7 @@ def _finite(*arrays):
 
 
 class _Planner:
-    """Plans one trajectory, in steps in which the fastest mode turns by at most a `phase` [rad]."""
+    """Plans one trajectory, in steps over which the phase of the fastest mode grows by at most `phase` [rad]."""
 
     def __init__(self, model, path, start, limit, phase=STABLE):
         self.model, self.start, self.limit = model, start, limit
@@ -220,7 +221,7 @@ class _Planner:
         end = np.zeros((3, n))
         path.evaluate(path.duration_ns, end)
         at_end = model.terms(end[0], end[1])
-        # The joints are prescribed here: the modes of the arm with its joints locked.
+        # The joints are prescribed here, so these are the modes of the arm with its joints locked.
         squares, shapes = eigh(at_end.K2, at_end.M[n:, n:]) if m else (np.array([100.0]), None)
         omega = np.sqrt(np.maximum(squares, 1e-6))
         self.omega = omega[0]
@@ -233,7 +234,7 @@ class _Planner:
         self.modal = shapes[:, :slow].T @ at_end.M[n:, n:] if m else np.zeros((0, 0))
         step = min(2.0 * np.pi / omega[max(slow, 1) - 1] / STEPS_PER_PERIOD, 0.01)
         self.steps = int(np.ceil(self.duration / min(step, phase / omega[-1])))
-        # The plan has fewer, where the fastest mode, which is not planned, needs short steps.
+        # The plan has fewer steps if the fastest mode, which is not planned, needs short ones.
         self.stride = max(1, int(PLANNED * step * self.steps / self.duration))
         self.steps = self.stride * int(np.ceil(self.steps / self.stride))
         if self.steps > MAX_STEPS:
@@ -244,19 +245,19 @@ class _Planner:
                 hint="plan it in parts, or set feedforward: model",
             )
         self.h = self.duration / self.steps
-        # Whole steps and the midpoints between, as Runge-Kutta wants them.
+        # Whole steps and the midpoints between, as the Runge-Kutta method needs them.
         self.times = np.linspace(0.0, self.duration, 2 * self.steps + 1)
         self.reference = np.zeros((self.times.size, 3, n))
         for k, t in enumerate(self.times):
-            # Up to the end, not at it: there the last polynomial's acceleration counts, not the rest after it.
+            # Just before the end, the acceleration is the last polynomial's, not that of the rest after it.
             path.evaluate(min(round(t * SECOND), path.duration_ns - 1), self.reference[k])
         knots = np.concatenate([np.zeros(5), knots, np.full(5, self.duration)])
         everything = BSpline(knots, np.eye(knots.size - 6), 5)
-        # Without the first and last three: zero at either end, with velocity and acceleration.
+        # Without the first and last three, the shift is zero at either end, with velocity and acceleration.
         self.basis = np.array([everything(self.times, nu)[:, 3:-3] for nu in range(3)])
 
     def solve(self):
-        """The plan, after up to `ROUNDS` about the last one."""
+        """The plan, after up to `ROUNDS` rounds, each about the result of the last one."""
         n = self.model.n_joints
         c, knots, sizes = np.zeros((n, self.basis.shape[2])), KNOTS[0], []
         for _ in range(ROUNDS if self.model.n_modes else 0):
@@ -299,7 +300,7 @@ class _Planner:
                 for part, values in zip(bent, self._step(i, x, v), strict=True):
                     states[i + 1, part] = values
             return tuple(states[:, part] for part in bent)
-        # The line in each step that has the acceleration's mean, by Simpson's rule, and its first moment.
+        # In each step, the straight line with the acceleration's mean, by Simpson's rule, and its first moment.
         change = np.diff(q[:, 2], axis=0)
         begin = (q[:-1, 2] + 4.0 * self.motion[1::2, 2] + q[1:, 2]) / 6.0 - 0.5 * change
         for i in range(self.steps):
@@ -310,7 +311,7 @@ class _Planner:
         return tuple(states[:, part] for part in bent)
 
     def _step(self, i, x, v):
-        """Bending and its rate after one step more, by Runge-Kutta's method."""
+        """Bending and its rate after one more step of the Runge-Kutta method."""
         h, (begin, middle, end) = self.h, self.motion[2 * i : 2 * i + 3]
         a1 = self._bending(*begin, x, v)[0]
         v2 = v + 0.5 * h * a1
@@ -334,15 +335,15 @@ class _Planner:
     def _linearise(self, x, v, knots):
         """Derivatives of the bending's acceleration and of the joint torque along a motion, at all times.
 
-        By deflection and its rate, and by the joints' position, velocity and acceleration: differences of (2) in
-        full, at so many times (`knots`) and linear between.
+        The derivatives with respect to the deflection and its rate, and to the joints' position, velocity and
+        acceleration, are finite differences of the full (2) at `knots` times, and linear between these.
         """
         n, m = self.model.n_joints, self.model.n_modes
         at = 2 * np.unique(np.linspace(0, self.steps, knots).astype(int))
         (found,) = _finite(np.array([self._derivatives(k, x[k // 2], v[k // 2]) for k in at]))
         flat = make_interp_spline(self.times[at], found.reshape(len(at), -1), 1)(self.times)
         everywhere = flat.reshape(-1, m + n, 3 * n + 3 * m)
-        # Columns: q, qd, qdd, x, v, and the bending's own acceleration, in the torque alone.
+        # Columns: q, qd, qdd, x, v, and the bending's own acceleration, which only the torque has.
         columns = np.cumsum([n, n, n, m, m])
         a, u = everywhere[:, :m], everywhere[:, m:]
         self.by_joints, self.spring, self.damper, _ = np.split(a, columns[2:], axis=2)
@@ -362,11 +363,11 @@ class _Planner:
                 there = self.model.inverse_dynamics(q, qd, qdd, x, v, a)
                 values[j] = kept
                 out[:, first + j] = (there - here) / SMALL
-        # The bending accelerates so that its forces stay zero; what that takes of the torque comes through M12.
+        # The bending accelerates so that its forces stay zero; the torque for this comes through M12.
         return np.vstack([-np.linalg.solve(M[n:, n:], out[n:]), out[:n]])
 
     def _bending(self, q, qd, qdd, x, v):
-        """Acceleration of the bending, and joint torque, with the joints moved as given: (2), in full."""
+        """Acceleration of the bending, and joint torque, by the full (2), with the joints moved as given."""
         n, model = self.model.n_joints, self.model
         M = model.mass_matrix(q, x)
         forces = model.inverse_dynamics(q, qd, qdd, x, v, np.zeros_like(x))
@@ -383,7 +384,7 @@ class _Planner:
         return out
 
     def _torque(self, bending, at):
-        """Joint torque that goes with `_respond`'s columns, (k, n, n count)."""
+        """Joint torque that belongs to `_respond`'s columns, (k, n, n count)."""
         n, count = self.model.n_joints, self.basis.shape[2]
         by = self.torque_by_joints[2 * at].reshape(-1, n, 3, n)
         u = np.einsum("tidj,dtc->tijc", by, self.basis[:, 2 * at]).reshape(-1, n, n * count)
@@ -392,7 +393,7 @@ class _Planner:
         return u
 
     def _change(self, c, knots):
-        """Change of the shift's coefficients, (n, count); with what each does as it was, or found at `knots` times."""
+        """Change of the shift's coefficients, (n, count), by the last derivatives, or by new ones at `knots` times."""
         x, v = _finite(*self._bend())
         at = np.unique(np.append(np.arange(0, self.steps, max(1, self.steps // GRID)), self.steps))
         if knots:
@@ -401,9 +402,9 @@ class _Planner:
             (self.torque_by,) = _finite(self._torque(forced, at))
             self.bends = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
         A, b = self.bends, -np.concatenate([self.modal @ (x[-1] - self.rest), self.modal @ v[-1]])
-        # On one scale: deflections are thousandths. A mode that no joint moves is left as it is.
+        # All rows get the same scale, since deflections are thousandths. A mode that no joint moves is left as it is.
         largest = np.abs(A).max(axis=1)
-        each = largest.reshape(2, -1) * [self.planned**2, self.planned]  # as of forces
+        each = largest.reshape(2, -1) * [self.planned**2, self.planned]  # scaled as forces
         moved = np.tile((each > UNMOVED * each.max(axis=1)[:, None]).all(axis=0), 2)
         scale = 1.0 / largest[moved]
         A, b = A[moved] * scale[:, None], b[moved] * scale
@@ -411,7 +412,7 @@ class _Planner:
         return self._within_limits(c, A, b, u, self.torque_by)
 
     def _refuse_beyond(self, torque):
-        """A `DesignError` for a torque, (k, n), that is beyond the limit."""
+        """Raise a `DesignError` for a torque, (k, n), beyond the limit."""
         needed = np.abs(torque).max(axis=0)
         if (needed > self.limit).any():
             raise DesignError(
@@ -423,10 +424,10 @@ class _Planner:
             )
 
     def _within_limits(self, c, A, b, u, du):
-        """As `_least_squares`, within the torque limit as far as that is found.
+        """As `_least_squares`, within the torque limit if such a solution is found.
 
-        What is beyond `RESERVED` of the limit is penalised, at the times and joints where it is, until these no longer
-        change.
+        Torque beyond `RESERVED` of the limit is penalised at the times and joints where it occurs, until these no
+        longer change.
         """
         bounded = np.flatnonzero(np.isfinite(self.limit))
         limit = self.limit[bounded]
@@ -445,9 +446,9 @@ class _Planner:
         return change
 
     def _least_squares(self, c, A, b, rows=None, values=None):
-        """The change x after which the mean square of the shift, and of its acceleration, is least, with A x = b.
+        """The change x with A x = b after which the mean square of the shift, and of its acceleration, is least.
 
-        `rows` x should be near `values`, by a penalty of weight `PENALTY`.
+        A penalty of weight `PENALTY` brings `rows` x near `values`.
         """
         n, count = c.shape
         N, Ndd = self.basis[0], self.basis[2] / self.omega**2

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs at every sample: samples, controller and supervisor."""
+"""The code that runs at every sample: samples, controller and supervisor."""

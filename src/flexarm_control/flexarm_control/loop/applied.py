@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the driver applies what is sent to it: its report of torque and controller beside the answers sent.
+"""Checks whether the driver applies the torque sent to it, by the torque and controller that it reports.
 
 A driver that refuses, clips or replaces the torque leaves the arm on its safe action while the reference goes on.
-Two reports show it. The torque that it says it applied must lie between the least and the largest sent in the last
+Two reports show this. The torque that it reports as applied must lie between the smallest and the largest of the last
 `SENT` answers, within `torque_mismatch` times the torque limit; so no delay needs to be known. A driver that
-confirms its controller (``controller_id``) must name this one. What contradicts for `PATIENCE` is a refusal.
+confirms its controller (``controller_id``) must name this one. A contradiction that lasts `PATIENCE` is a refusal.
 
-A driver names its controller one sample before it applies its torque. When it does so for the first time long after
-the first torque was sent (DDS had not found it yet, say), the torque has to begin anew: the reference may be far away.
+A driver names its controller one sample before it applies its torque. If it does so for the first time long after the
+first torque was sent (say, because DDS had not found it yet), the torque has to start again, since the reference may be
+far away.
 """
 
 import numpy as np
@@ -16,16 +17,16 @@ from flexarm_dynamics.parameters import parameter
 
 from .. import kernels
 
-#: Answers that the reported torque may belong to.
+#: Number of last answers that the reported torque may belong to.
 SENT = 64
-#: A contradiction that lasts for this long is a refusal [s]: several of the driver's timeouts, since a machine that is
-#: busy for a moment is none.
+#: A contradiction that lasts this long is a refusal [s]. This is several of the driver's timeouts, since a machine that
+#: is busy for a moment does not refuse.
 PATIENCE = 0.25
 
 PARAMETERS = (
     parameter("torque_mismatch", 0.1, "-", 0.0, 10.0).described(
-        "Largest difference between the torque sent and what the driver reports to apply, over the torque limit, for"
-        " 0.25 s; beyond it a fault. 0.0: not compared."
+        "Largest difference between the torque sent and the torque that the driver reports as applied, as a fraction of"
+        " the torque limit. A larger one for 0.25 s is a fault. 0.0: not compared."
     ),
 )
 
@@ -55,11 +56,11 @@ class Applied:
         self._tolerance = np.where(np.isfinite(limit), share * limit, np.inf) if share else None
 
     def forget(self):
-        """Another driver, perhaps: whether it confirms controllers is not known."""
+        """Forget whether the driver confirms controllers: it may be another driver."""
         self._confirms = False
 
     def begin(self, torque):
-        """The first torque (n,) [N m] after an interruption."""
+        """Begin with the first torque (n,) [N m] after an interruption."""
         self._sent[:] = torque
         self._at = 0
         self._other_for = self._wrong_for = self._unconfirmed_for = 0.0
@@ -70,13 +71,13 @@ class Applied:
         self._sent[self._at] = torque
 
     def judge(self, sample, controller_id, dt):
-        """Why the driver's report contradicts what this controller sends; empty where it does not.
+        """Why the driver's report contradicts what this controller sends; empty if it does not.
 
         Parameters
         ----------
         sample : ArmSample
         controller_id : int
-            Of this controller; 0: unknown, not compared.
+            Id of this controller; 0: unknown, not compared.
         dt : float
             Time since the last sample [s].
         """
@@ -99,7 +100,7 @@ class Applied:
         return ""
 
     def _is_other(self, sample, controller_id):
-        """Whether the driver's report of its controller names none, or another."""
+        """Whether the driver reports another controller, or none."""
         if not controller_id:
             return False
         confirmed = sample.controller_id == controller_id
@@ -113,7 +114,7 @@ class Applied:
         return max(self._other_for, self._unconfirmed_for)
 
     def _mismatch(self, reported):
-        """The joint whose reported torque is none of those sent; None where all are, or are unknown."""
+        """The joint whose reported torque is none of those sent; None if there is no such joint, or all are unknown."""
         tolerance, last = self._tolerance, self._sent[self._at]
         if tolerance is None or self._kernels.alike(reported, last, tolerance):
             return None

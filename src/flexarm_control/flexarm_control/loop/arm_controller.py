@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of an arm: reference, composite control and limits, supervised; samples in, torques out."""
+"""The supervised controller of an arm, with reference, composite control and limits: samples in, torques out."""
 
 import numpy as np
 
@@ -18,18 +18,18 @@ from .samples import ArmSample, SampleOrder, clock_jumped
 from .supervisor import State, Supervisor, longest_period
 from .torque_delay import TorqueDelay
 
-#: Time in which the fast control comes back, or goes, when it is switched [s].
+#: Duration of the ramp in which the fast control is switched on or off [s].
 FAST_RAMP = 0.1
 
-#: A source that restarts during operation must find each joint within this of where it was [rad], and at rest [rad/s].
+#: When a source restarts during operation, each joint must be this close to where it was [rad], and at rest [rad/s].
 SAME_PLACE, AT_REST = 0.01, 0.05
-#: An arm that seems to move is seen for so long before its first torque: a velocity may be noise, or a swing [s].
+#: An arm that seems to move is watched this long before its first torque, as a velocity may be noise or a swing [s].
 SEEN = 0.01
-#: So many periods without a state are no interruption, however long.
+#: This many periods without a state are no interruption, however long they are.
 PERIODS_OF_GAP = 5.0
-#: A doubt that its source does not explain.
+#: Text of a doubt that its source does not explain.
 UNSTATED = "the source asks for a stop"
-#: More repeats of one state than this are a fault: they are no sign of life.
+#: More repeats of one state than this are a fault, since repeats are no sign of life.
 MAX_REPEATS = 10
 
 #: Parameters of the controller that belong to no single law.
@@ -37,31 +37,31 @@ PARAMETERS = (
     *authority.PARAMETERS,
     *applied.PARAMETERS,
     parameter("resume_gap", 0.05, "s", 1e-3, 1e4).described(
-        "After a longer time without a state the motion is given up, and torque returns in a ramp; set it to the"
-        " driver's torque_timeout. A gap of up to five periods is none."
+        "After a longer time without a state, the motion is given up and torque returns in a ramp. Set it to the"
+        " driver's torque_timeout. Up to five periods are no gap."
     ),
     parameter("trajectory_torque_margin", 1.0, "-", 0.0, 1e3).described(
-        "Largest torque that a trajectory may need, as a multiple of the torque limit: rigid arm with weight and"
-        " friction, payload of the arm file; what needs more is refused. 0.0: not judged."
+        "Largest torque that a trajectory may need, as a multiple of the torque limit; one that needs more is refused."
+        " Computed for the rigid arm with weight, friction and the arm file's payload. 0.0: not checked."
     ),
     parameter("allow_partial_joints_goal", False).described(
-        "Whether a trajectory may leave out joints: they stay where they are held. While the arm moves it may not."
+        "Whether a trajectory may leave out joints, which then stay where they are held; not while the arm moves."
     ),
     parameter("join_late_trajectories", False).described(
-        "Whether a trajectory whose stamp is past, and whose end is not, is joined midway, as"
-        " joint_trajectory_controller does; it is refused otherwise."
+        "Whether a trajectory whose stamp is in the past, and whose end is not, is joined midway, as"
+        " joint_trajectory_controller does; otherwise it is refused."
     ),
     *streams.PARAMETERS,
     parameter("speed_scaling", 1.0, "-", 0.0, 1.0).described(
-        "Factor on the time of trajectories: they are followed so much slower, and it changes smoothly; 0.0: the arm"
-        " rests on its way. Stops are not scaled."
+        "Factor on the speed at which trajectories are followed. It changes smoothly. 0.0: the arm rests on its way."
+        " Stops are not scaled."
     ),
     *supervisor.PARAMETERS,
     *estimator.PARAMETERS,
 )
 
 START_TOLERANCE = parameter("start_tolerance", 0.01, "rad", 0.0, 10.0, read_only=True).described(
-    "How far a first point at time 0 may lie from the reference; farther is refused."
+    "How far a first point at time 0 may lie from the reference; a trajectory that begins farther away is refused."
 )
 
 
@@ -81,29 +81,31 @@ class ArmController:
     Attributes
     ----------
     torque : ndarray
-        What to send [N m], shape (n,); zero when not `enabled`.
+        Torque to send [N m], shape (n,); zero when not `enabled`.
     enabled : bool
         Whether the torque may be applied, or each joint's safe action is to be taken.
     supervisor : Supervisor
         State and limits.
     law, answered_by : CompositeControl
-        For the next sample, and the one that made `torque`: `law` may be replaced whole at any time.
+        The control for the next sample, and the one that computed `torque`; `law` may be replaced as a whole at any
+        time.
     fast_enabled : bool
         Whether the fast control takes part, see `enable_fast`.
     saturated : bool
-        A limit was met at this sample.
+        Whether a limit was met at this sample.
     late, missed, interruptions : int
-        Samples that came after a later one, and were left out; that never came; gaps in which torque was lost.
+        Numbers of samples that came after a later one and were ignored, of samples that never came, and of gaps in
+        which torque was lost.
     alive : bool
-        Whether the last sample was a sign of life of the source: a new one, or its clock stands still.
+        Whether the last sample was a sign of life of the source: it was new, or the source's clock stands still.
     torque_delay : TorqueDelay
-        How long after a state's stamp its torque acts, from what the driver reports.
+        Measures how long after a state's stamp its torque acts, from what the driver reports.
     controller_id : int
-        Under which torques are sent; 0: not known, and not looked for in what the driver confirms.
+        Id under which torques are sent; 0: unknown, and not compared with the id that the driver confirms.
     judged : tuple of str
-        Name of the last trajectory that was accepted or refused, and why it was refused, or empty.
+        Name of the last trajectory that was accepted or refused, and the reason for a refusal, or empty.
     payload : PayloadEstimator or None
-        What `learn` finds of the payload; None: `payload_estimate` is off.
+        Estimate of the payload, which `learn` updates; None: `payload_estimate` is off.
     """
 
     def __init__(self, model, law, settings, start_tolerance=0.01):
@@ -127,8 +129,8 @@ class ArmController:
         self.late = self.missed = self.controller_id = 0
         self._order, self._repeats = SampleOrder(), 0
         self._last_ns, self._period = 0, 0.0  # [ns], [s]
-        self._jumped_ns = 0  # so far the source's clock went ahead of the reference's own [ns]
-        self._count = 1  # states since the last one, with those that were missed
+        self._jumped_ns = 0  # how far the source's clock jumped ahead of the reference's own [ns]
+        self._count = 1  # states since the last one, missed ones included
         self._doubt = ""  # of the last sample
         self._foreign = self.interruptions = 0
         self._position = np.zeros(n)  # at the last sample
@@ -141,7 +143,7 @@ class ArmController:
         self.torque_delay = TorqueDelay(n)
         self._take_limits(settings)
         self.payload = self._estimator(settings)
-        # So long the joints have been slow, as far as the payload needs to know [s].
+        # How long the joints have been slow, for the payload [s].
         self._slow_for, self._bending_period = 0.0, longest_period(model)
 
     def _estimator(self, settings):
@@ -172,12 +174,12 @@ class ArmController:
 
     @property
     def payload_scale(self):
-        """Payload that the control is made for, in parts of the arm file's [-]."""
+        """Payload that the control is designed for, as a multiple of the arm file's [-]."""
         return self.law.model.payload_scale
 
     @property
     def payload_wanted(self):
-        """Payload that the control should be made for now; None: as it is, or the arm does not rest."""
+        """Payload that the control should be designed for now; None: keep the present one, or the arm does not rest."""
         found = self.payload
         if found is None or found.reason or self.law.slow.learns:
             return None
@@ -190,18 +192,18 @@ class ArmController:
     @property
     def _rests(self):
         at_rest = self.state in (State.READY, State.HOLDING) and self.reference.resting is not None
-        # An arm that swings stands at its turning points, too.
+        # An arm that swings stands still at its turning points, too.
         return at_rest and not self._doubt and self._slow_for >= 0.5 * self._bending_period
 
     def carry(self, law):
-        """Go on with a control made for another payload; False where the arm does not rest: then nothing changes."""
+        """Go on with a control for another payload; returns False, and changes nothing, if the arm does not rest."""
         if not self._rests:
             return False
         self.replace_law(law)
         return True
 
     def _note(self, sample, dt):
-        """Keep what the estimate of the payload needs of a sample, before its torque is computed."""
+        """Keep the data of a sample that the payload estimate needs, before the sample's torque is computed."""
         slow = np.abs(sample.velocity).max() < AT_REST
         self._slow_for = self._slow_for + dt if slow else 0.0
         if self._doubt:
@@ -214,7 +216,7 @@ class ArmController:
         )
 
     def configure(self, settings):
-        """Take new limits whole; call between two samples.
+        """Take new limits, all at once; call between two samples.
 
         Raises
         ------
@@ -260,7 +262,7 @@ class ArmController:
         return self.supervisor.reason or self._trajectory_reason
 
     def view(self):
-        """What there is to see of the last sample: arrays by the field names of `CompositeState`.
+        """Values at the last sample, as arrays by the field names of `CompositeState`.
 
         Errors, parts of the torque and deflections are 0.0 where no torque was computed.
         """
@@ -289,7 +291,7 @@ class ArmController:
 
     @property
     def held(self):
-        """Where joints stay that a trajectory leaves out, (n,) [rad]; None: it has to name all. Any thread may ask."""
+        """Where joints stay that a trajectory leaves out, (n,) [rad]; None: it must name all. Any thread may ask."""
         if not self.supervisor.settings["allow_partial_joints_goal"]:
             return None
         resting = self.reference.resting
@@ -311,13 +313,14 @@ class ArmController:
 
     @property
     def plans(self):
-        """Whether a trajectory is worth a `prepare` before it is offered."""
+        """Whether a trajectory should pass `prepare` before it is offered."""
         return self.law.feedforward is not None and self.law.feedforward.plans
 
     def prepare(self, trajectory):
-        """Design work for a `trajectory` that is about to be offered, for `offer`; off the control path.
+        """Do the design work for a `trajectory` before `offer`, which takes the result; off the control path.
 
-        None where there is nothing to prepare; a `DesignError` where it can't be done: then offer it without.
+        Returns None if there is nothing to prepare. Raises a `DesignError` if it can't be done; then offer the
+        trajectory without it.
         """
         start = self.reference.resting
         if start is None or not self.plans:
@@ -326,7 +329,7 @@ class ArmController:
 
     @property
     def torque_allowed(self):
-        """Largest torque that a trajectory may need, shape (n,) [N m]; infinite: it is not judged."""
+        """Largest torque that a trajectory may need, shape (n,) [N m]; infinite: not checked."""
         margin = self.supervisor.settings["trajectory_torque_margin"]
         if margin == 0.0 or self.law.free:
             return np.full(self.model.n_joints, np.inf)
@@ -336,14 +339,14 @@ class ArmController:
         refuse_torque(self.model, trajectory, start, self.torque_allowed)
 
     def offer(self, trajectory, plan=None, judged=False, name=""):
-        """Offer a `trajectory`, with the `plan` that `prepare` made for it; a refusal is kept in `reason`.
+        """Offer a `trajectory`, with the `plan` that `prepare` made for it; `reason` keeps a refusal.
 
-        Its `name` is in `judged` then.
+        The attribute `judged` then has its `name`.
 
-        The torque that it needs is judged here, which takes a while, unless that has been done: `judged`.
+        The torque that it needs is checked here, which takes a while, unless the argument `judged` is true.
 
-        While the observer converges, too: one with stamp 0 then starts with the first torque; one whose
-        explicit start passes before that is given up.
+        A trajectory may also be offered while the observer converges. With stamp 0 it then starts with the first
+        torque; if its explicit start passes before that, it is given up.
 
         Returns
         -------
@@ -373,19 +376,19 @@ class ArmController:
         return verdict
 
     def step(self, sample, now_ns=None):
-        """Answer one estimated state; the control path.
+        """Answer one estimated state; runs on the control path.
 
         Parameters
         ----------
         sample : ArmSample
             With amplitude and rate.
         now_ns : int, optional
-            The time on the clock that stamps are of [ns]; wanted with `synchronised_clocks`.
+            The time on the stamps' clock [ns]; needed with `synchronised_clocks`.
 
         Returns
         -------
         bool or None
-            `enabled`; None for a sample that came after a later one: it has had its answer, or needs none. A
+            `enabled`; None for a sample that came after a later one, since it has had its answer or needs none. A
             repeated (session, sequence) is answered as before.
         """
         if not self.model.n_modes:
@@ -429,7 +432,7 @@ class ArmController:
         return self._control(sample, dt)
 
     def _control(self, sample, dt):
-        """The torque for a sample that can be trusted; whether it may be applied."""
+        """Compute the torque for a sample that can be trusted; returns whether it may be applied."""
         law, reference, supervisor = self.law, self.reference, self.supervisor
         if self.payload is not None:
             self._note(sample, dt)
@@ -474,7 +477,7 @@ class ArmController:
         return self.enabled
 
     def _expect(self, path):
-        """Another path is followed, or none: where its torque was judged, the arm can brake with its accelerations."""
+        """Note the path that is followed now, or None; if its torque was checked, the arm can brake as it does."""
         self._expected = path
         most = np.zeros(self.model.n_joints)
         if path is not None and np.isfinite(self.torque_allowed).all():
@@ -483,7 +486,7 @@ class ArmController:
         self.supervisor.expect(most)
 
     def _fast_fraction(self, fraction, dt):
-        """Fraction of the fast torque that is applied: it follows `enable_fast` in a ramp."""
+        """Fraction of the fast torque that is applied, which follows `enable_fast` in a ramp."""
         if fraction == self.fast_enabled:
             return fraction
         goal, step = float(self.fast_enabled), dt / FAST_RAMP
@@ -509,8 +512,7 @@ class ArmController:
     def brake(self, reason):
         """Bring the reference to rest smoothly, and hold it there; trajectories are given up.
 
-        The log and the controller's state give the `reason`. False where there is no torque to do it with: nothing
-        has changed.
+        The log and the controller's state give the `reason`. Returns False, and changes nothing, if there is no torque.
         """
         if not self.enabled:
             return False
@@ -527,7 +529,7 @@ class ArmController:
         return True
 
     def recover(self):
-        """Leave a fault: torque again with the next valid state, from where the arm is then; whether there was one."""
+        """Leave a fault, and return whether there was one; the next valid state gives torque, from where the arm is."""
         self._foreign = self._repeats = 0
         return self.supervisor.recover()
 
@@ -541,14 +543,14 @@ class ArmController:
         self._off()
 
     def distrust(self, reason):
-        """No torque, for the state can't be trusted: a fault where there was torque, else until a valid one comes."""
+        """Give no torque, as the state can't be trusted: a fault if there was torque, else until a valid one comes."""
         if self.payload is not None:
             self.payload.discard(reason)
         self.supervisor.doubt(reason)
         self._off()
 
     def disable(self, reason):
-        """No torque until a valid state comes, and no fault: the node ends, or waits for its observer."""
+        """Give no torque until a valid state comes, without a fault: the node ends, or waits for its observer."""
         self.supervisor.wait(reason)
         self._off()
 
@@ -559,20 +561,20 @@ class ArmController:
     # Samples -------------------------------------------------------------------------------------
 
     def _judge(self, sample, now_ns):
-        """Class of the sample, which is the last one from now on; raises for one that can't be used."""
+        """Class of the sample, which counts as the last one from now on; raises an error if it can't be used."""
         order = self._order
         verdict = order.judge(sample)
         if verdict == SampleOrder.STALE:
             return verdict
         if verdict == SampleOrder.FOREIGN:
             self._foreign += 1
-            if self._foreign > 1:  # a single late message of a source that has ended is none
+            if self._foreign > 1:  # one late message of an ended source is not a second source
                 self.supervisor.fail(str(order.two_sources(sample)))
             raise order.two_sources(sample)
         since_ns = sample.stamp_ns - order.stamp_ns
         missed = max(sample.sequence - order.sequence - 1, 0)
         if verdict != SampleOrder.REPEAT:
-            order.take(sample)  # a bad one, too: what comes next is judged beside it
+            order.take(sample)  # a bad one, too: the next one is compared with it
         if verdict == SampleOrder.JUMP:
             raise _refused_stamp(
                 -since_ns, "s before the last state, so the source's clock went back"
@@ -601,7 +603,7 @@ class ArmController:
             raise _refused_stamp(abs(age), f"s {when} is beyond max_age", self._max_age, hint)
 
     def _lacks(self, sample, verdict):
-        """What is not known yet that torque needs; empty if all is."""
+        """What torque needs and is not known yet; empty if everything is known."""
         if sample.amplitude is None:
             return "modal_amplitude is not known yet"
         if sample.rate is None and self.law.needs_rates:
@@ -612,7 +614,7 @@ class ArmController:
         return ""
 
     def _wait(self, sample, verdict, reason):
-        """No torque, for a `reason`; the joints are known, so that trajectories may be offered."""
+        """Give no torque, for a `reason`; the joints are known, so trajectories may be offered."""
         waiting = self._waiting and verdict != SampleOrder.RESTART
         if verdict == SampleOrder.RESTART:
             self.disable(reason)
@@ -628,7 +630,7 @@ class ArmController:
             self._seen = [self._seen[-1], (sample.stamp_ns, sample.position.copy())]
 
     def _begin(self, sample, verdict):
-        """First torque of a session, or after a time without: from the position that is found."""
+        """Begin with the first torque of a session, or after a time without torque, from the present position."""
         if verdict == SampleOrder.RESTART:
             self._applied.forget()
         keeps = self._waiting and verdict != SampleOrder.RESTART and self.reference.pending
@@ -638,9 +640,9 @@ class ArmController:
         self._return(sample, self._seen[0] if self._waiting else None, keeps)
 
     def _return(self, sample, since, keeps=False):
-        """Torque returns in a ramp; the reference begins where the arm is, and brakes it where it moves.
+        """Let torque return in a ramp; the reference begins where the arm is, and brakes the arm if it moves.
 
-        `since` are the stamp [ns] and the positions (n,) [rad] of an earlier sample; None: its mean speed says nothing.
+        `since` has the stamp [ns] and the positions (n,) [rad] of an earlier sample; None: there is no mean speed.
         """
         if not keeps:
             self._take_over(sample, since)
@@ -652,7 +654,7 @@ class ArmController:
         self.law.reset()
 
     def _take_over(self, sample, since):
-        """The reference begins where the arm is, and brakes it from how it moves."""
+        """Let the reference begin where the arm is, and brake the arm from its present motion."""
         position, stamp, velocity = sample.position, sample.stamp_ns, None
         if _moves(sample):
             velocity = sample.velocity if since is None else _steady_velocity(sample, *since)
@@ -664,17 +666,17 @@ class ArmController:
             self.reference.start(position, stamp)
 
     def _rest_on(self, position, stamp_ns):
-        """The reference holds a position (n,) [rad], by the source's clock as it is at a stamp [ns]."""
+        """Let the reference hold a position (n,) [rad], by the source's clock as it is at a stamp [ns]."""
         self._jumped_ns = 0
         self.reference.start(position.copy(), stamp_ns)
 
     def _seen_for(self, sample, verdict):
-        """For how long positions have been seen while the controller waited, `SEEN` or a little more [s]."""
+        """Time for which positions have been seen while the controller waited, `SEEN` or a little more [s]."""
         waiting = self._waiting and verdict != SampleOrder.RESTART
         return 1e-9 * (sample.stamp_ns - self._seen[0][0]) if waiting else 0.0
 
     def _interrupted(self, sample, what, since=None):
-        """The driver took its safe action for a time, for the reason `what`; `since` as in `_return`."""
+        """Go on after the driver took its safe action, for the reason `what`; `since` is as in `_return`."""
         moved = self.reference.active or self.reference.pending
         self.interruptions += 1
         self._trajectory_reason = f"{what}: torque returns in a ramp" + (
@@ -683,10 +685,10 @@ class ArmController:
         self._return(sample, since)
 
     def _after_gap(self, sample, gap, period):
-        """Time that the control takes to have passed over a gap between two stamps [s], 0 where torque was lost.
+        """Time that counts as passed in a gap between two stamps [s]; 0 if torque was lost.
 
-        Where the joints show that it was the source's clock which jumped, the reference goes on by its own time, and
-        the arm comes to rest on its path.
+        If the joints show that the source's clock jumped, the reference goes on by its own time, and the arm comes to
+        rest on its path.
         """
         by_number = period * self._count
         if not gap > PERIODS_OF_GAP * by_number > 0.0:
@@ -702,7 +704,7 @@ class ArmController:
         return by_number
 
     def _restarted(self, sample):
-        """Why a new session of the source is a fault; empty for an arm that rests where it did."""
+        """Why a new session of the source is a fault; empty for an arm that rests where it was."""
         reference, names = self.reference, self.model.joint_names
         if reference.active or reference.pending or reference.stopping:
             return "the source of the states has restarted during a motion: is its zero the same?"
@@ -719,7 +721,7 @@ class ArmController:
         return ""
 
     def _may_go_on(self, sample):
-        """Whether a repeated state may give torque anew; it is a fault if it is repeated too often, or changed."""
+        """Whether a repeated state may give torque again; one that is repeated too often, or changed, is a fault."""
         if not (self.enabled or self._waiting):
             if sample.stamp_ns != self._order.stamp_ns:
                 self.distrust(f"state {sample.sequence} came again with another stamp")
@@ -734,7 +736,7 @@ class ArmController:
         return False
 
     def _left_behind(self, sample):
-        """Why what was offered while waiting can't be followed from here; empty if it can."""
+        """Why the trajectory that was offered while waiting can't be followed from here; empty if it can."""
         if self.reference.overdue(sample.stamp_ns):
             return "the trajectory was to start before the observer had converged: send it again"
         moved = np.abs(sample.position - self.reference.position)
@@ -745,10 +747,10 @@ class ArmController:
 
 
 def _steady_velocity(sample, stamp_ns, position):
-    """Joint velocities without what is noise or a swing, (n,) [rad/s]: no faster than the mean since an earlier sample.
+    """Joint velocities without noise and swings, (n,) [rad/s]: no faster than the mean since an earlier sample.
 
-    An estimate that has just begun, or that knows nothing of a safe action, and light joints, which bent links turn
-    to and fro, have velocities with which the arm does not go anywhere.
+    An estimate that has just begun, or does not know of a safe action, has velocities with which the arm does not go
+    anywhere. So have light joints, which bent links turn to and fro.
     """
     time = 1e-9 * (sample.stamp_ns - stamp_ns)
     mean = (sample.position - position) / max(time, 1e-9)
@@ -763,7 +765,7 @@ def _moves(sample):
 
 
 def _refused_stamp(ns, problem, limit_ns=None, hint=""):
-    """What refuses a state for the time [ns] from its stamp to another one."""
+    """The error that refuses a state because of the time [ns] from its stamp to another one."""
     value = float(f"{1e-9 * ns:.3g}")
     limit = None if limit_ns is None else float(f"{1e-9 * limit_ns:g}")
     return MessageError(problem, field="header.stamp", value=value, limit=limit, hint=hint)

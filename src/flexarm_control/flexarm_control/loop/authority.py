@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How much of the law's torque is sent: its size, its rate of change, and the ramp with which it returns.
+r"""Bounds the law's torque before it is sent: its size, its rate of change, and the ramp in which it returns.
 
-After any time without torque, the law's torque u comes back about the torque u_g that holds the arm's weight where
-it is found,
+After any time without torque, the law's torque u comes back about the torque u_g that holds the arm's weight in its
+present position,
 
 .. math:: u_{sent} = u_g + a(t)\,(u - u_g), \qquad a = \min(1, (t/T)^2),
 
-so that torque and stiffness grow together; u - u_g is bounded by the torque limit. With T = `return_time` of 65 ms, a
-is below a tenth for the first 20 ms.
-Without gravity u_g is zero. Where u begins within `SMALL` of u_g, at rest, there is nothing to return from: no ramp.
+so that torque and stiffness grow together. u - u_g is bounded by the torque limit. With T = `return_time` of 65 ms, a
+is below a tenth for the first 20 ms. Without gravity u_g is zero. If the arm rests and u begins within `SMALL` of u_g,
+there is no ramp.
 
-The rate is bounded in any case; lost samples add nothing to what the next one may change, since an estimate is at its
-worst after them. The budget of an arm that states none is :math:`8\,\omega_1` times its torque limit
-per second, with omega_1 its lowest bending frequency with the joints locked: a torque that swings between its limits
+The rate is always bounded. Lost samples do not raise the change that the next one may make, since an estimate is at its
+worst after them. If the arm file gives no limit of the rate, its budget is :math:`8\,\omega_1` times the torque limit
+per second, with omega_1 the lowest bending frequency with the joints locked: a torque that swings between its limits
 eight times as fast as the softest mode. A motion needs a hundredth of it.
 """
 
@@ -25,11 +25,11 @@ from flexarm_dynamics.singular_perturbation import slow_torque
 from .. import kernels
 from ..arrays import clip
 
-#: Of the torque limit: an arm that is taken over with less than this needs no ramp.
+#: Fraction of the torque limit; an arm whose torque begins with a smaller change needs no ramp.
 SMALL = 0.02
-#: A rate that is none [N m/s].
+#: Rate limit that means none [N m/s].
 NO_RATE = 1e9
-#: Budget of an arm that states none, over its torque limit and lowest bending frequency.
+#: Rate budget of an arm whose file gives none, over its torque limit and lowest bending frequency.
 BUDGET = 8.0
 
 PARAMETERS = (
@@ -37,8 +37,8 @@ PARAMETERS = (
         "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's."
     ),
     parameter("torque_rate_limit", [0.0], "N m/s", 0.0, NO_RATE, length="joints").described(
-        "Largest change of torque per second, against the last torque sent; 0.0: the arm file's limits.torque_rate;"
-        " 1e9: none."
+        "Largest change of torque per second, relative to the last torque sent; 0.0: the arm file's limits.torque_rate;"
+        " 1e9: no limit."
     ),
     parameter("return_time", 0.065, "s", 0.0, 10.0).described(
         "Time in which torque returns after an interruption, and at the start; 0.0: at once."
@@ -57,7 +57,7 @@ def torque_rates(model):
 
 
 class Authority:
-    """Torque within its size and rate, returned in a ramp; see the module.
+    """Torque within its limits of size and rate, which returns in a ramp; see the module.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Authority:
     limit, rate : ndarray, shape (n,)
         Active limits [N m], [N m/s]; infinite where there is none.
     torque : ndarray, shape (n,)
-        What was sent last [N m]; overwritten in place.
+        The torque sent last [N m]; overwritten in place.
     returned : bool
         Whether the ramp is over.
     """
@@ -99,11 +99,11 @@ class Authority:
 
     @property
     def returned(self):
-        """Whether all of the torque is there."""
+        """Whether the full torque is back."""
         return self._elapsed >= self._time
 
     def begin(self, q, rests):
-        """Torque returns, to an arm at q (n,) [rad] that `rests` or not: first what holds its weight there."""
+        """Let torque return to an arm at q (n,) [rad] that `rests` or not, beginning with the torque for its weight."""
         self._elapsed, self._first = 0.0, rests
         self._weight[:] = self._holding(q)
         clip(self._weight, -self.limit, self.limit)
@@ -118,20 +118,20 @@ class Authority:
         return np.where(np.isfinite(found), found, 0.0)
 
     def off(self):
-        """No torque."""
+        """Set the torque to zero."""
         self.torque[:] = 0.0
 
     def send(self, u, dt, period):
-        """Put what may be sent of a torque u (n,) [N m] into `torque`.
+        """Set `torque` to what may be sent of a torque u (n,) [N m].
 
         Parameters
         ----------
         u : ndarray, shape (n,)
-            What the law gives [N m].
+            Torque of the law [N m].
         dt : float
-            Since the last torque [s].
+            Time since the last torque [s].
         period : float
-            Part of it for which the torque's rate counts: without lost samples [s].
+            Part of `dt` that counts for the torque's rate: without lost samples [s].
 
         Returns
         -------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One sample of the arm, as plain arrays: what observers and controllers work on."""
+"""One sample of the arm as plain arrays, on which observers and controllers work, and the order of samples."""
 
 from collections import deque
 
@@ -11,33 +11,33 @@ from .. import kernels
 
 
 class ArmSample:
-    """What was measured at one instant, in the arm file's order, SI.
+    """Measurements at one instant, in the arm file's order and SI units.
 
     Attributes
     ----------
     stamp_ns : int
         Time of measurement [ns].
     session, sequence : int
-        Which run of the source, and which sample of it.
+        Run of the source, and number of the sample in it.
     position, velocity, torque : ndarray, shape (n,)
         Joint position [rad], velocity [rad/s], torque applied until now [N m] (NaN: unknown).
     strain : ndarray, shape (gauges,) or None
         Surface strain [-].
     amplitude, rate : ndarray, shape (m,) or None
-        Modal amplitudes [m, rad] and rates [m/s, rad/s]; None where not known.
+        Modal amplitudes [m, rad] and rates [m/s, rad/s]; None if not known.
     velocity_known : bool
-        False where the source gave no joint velocity.
+        False if the source gave no joint velocity.
     controller_id : int
-        Of the controller whose answer to this state acts; 0: of none, or unknown.
+        Id of the controller whose answer to this state acts; 0: none, or unknown.
     trust : int
-        `TRUSTED`; `STOP`: to bring the arm to rest with; `DISTRUSTED`: not to be used.
+        `TRUSTED`; `STOP`: only to be used to bring the arm to rest; `DISTRUSTED`: not to be used.
     doubt : str
         Which sensor is in doubt, and why; empty if none is.
     clock_stopped : bool
-        The source's clock stands still until it is answered or goes on: it sends the same sample again.
+        Whether the source's clock stands still until it is answered or goes on; it sends the same sample again.
     """
 
-    #: As in ArmState.
+    #: Values as in ArmState.
     TRUSTED, STOP, DISTRUSTED = range(3)
 
     __slots__ = (
@@ -74,7 +74,7 @@ class ArmSample:
         return self.session, self.sequence
 
     def check(self, model):
-        """Refuse values that are not finite or beyond any arm's; what is not known is not judged.
+        """Refuse values that are not finite or beyond any arm's; unknown values are not checked.
 
         Raises
         ------
@@ -103,20 +103,20 @@ class ArmSample:
 WRAP = 2**32
 
 
-#: A clock has jumped where the time by the numbers fits the positions this much better than that of the stamps [-].
+#: A clock has jumped if the error of the positions by the numbers is below this fraction of that by the stamps [-].
 JUMP_FITS = 0.25
 
 
 def clock_jumped(moved, velocity, by_number, by_stamp):
-    """Whether a stamp that is too late for its number tells of a clock that jumped, not of a source that stood still.
+    """Whether a stamp too late for its number means that the clock jumped, and not that the source stood still.
 
-    Which of them shows in the positions: whether the joints have moved as far as in the one time or in the other. A
-    joint at rest shows neither: then False.
+    The positions show which: whether the joints have moved as far as in the one time or in the other. Joints at rest
+    show neither; the result is then False.
 
     Parameters
     ----------
     moved, velocity : ndarray, shape (n,)
-        Since the last sample [rad], [rad/s].
+        Movement since the last sample [rad], and velocity [rad/s].
     by_number, by_stamp : float
         Time since the last sample, by the numbers of the samples and by their stamps [s].
     """
@@ -127,13 +127,13 @@ def clock_jumped(moved, velocity, by_number, by_stamp):
 class SampleOrder:
     """Compares each sample with the last one, by number and stamp, never by a clock.
 
-    NEW: the next; REPEAT: the last one again; RESTART: of a session not seen before; STALE: an older one of this
-    session; JUMP: a later number with a stamp that is not later, as the source's clock went back; FOREIGN: of a
-    session that was left for the present one, so that two sources send.
+    NEW: the next sample; REPEAT: the last one again; RESTART: of a session not seen before; STALE: an older one of this
+    session; JUMP: a later number with a stamp that is not later, since the source's clock went back; FOREIGN: of a
+    session that the present one replaced, so that two sources send.
     """
 
     NEW, REPEAT, RESTART, STALE, JUMP, FOREIGN = range(6)
-    #: After this many such samples without others, a session that was left, or an earlier number, is followed again.
+    #: After this many FOREIGN or STALE samples without others, their session or number is followed again.
     ALONE = 200
 
     def __init__(self):
@@ -141,7 +141,7 @@ class SampleOrder:
         self._left, self._other = deque(maxlen=16), 0
 
     def judge(self, sample):
-        """Class of `sample` beside the last one taken."""
+        """Class of `sample`, compared with the last one taken."""
         if sample.session != self.session:
             return self._or_restart(self.FOREIGN) if sample.session in self._left else self.RESTART
         ahead = (sample.sequence - self.sequence) % WRAP  # a uint32 wraps after 50 days at 1 kHz
@@ -157,7 +157,7 @@ class SampleOrder:
         return verdict if self._other < self.ALONE else self.RESTART
 
     def two_sources(self, sample):
-        """What refuses a FOREIGN sample."""
+        """The error that refuses a FOREIGN `sample`."""
         sessions = f"sessions {self.session} and {sample.session}"
         return MessageError(f"two sources send states ({sessions})", hint="stop one of them")
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Safety supervisor: the controller's state, and the limits that stop the arm.
 
-States and what leads from one to the next:
+States and transitions:
 
-- INACTIVE: no torque; until a valid state and a converged observer, then READY. Entered and left automatically.
+- INACTIVE: no torque until there are a valid state and a converged observer, then READY. Entered and left
+  automatically.
 - READY, TRACKING, HOLDING: torque, before, during and after a trajectory.
 - STOPPING: torque. The *reference* is brought to rest from where it is (not from the measurement) while the fast
   control continues to damp; then HOLDING.
@@ -14,10 +15,10 @@ The arm is stopped smoothly when a limit is exceeded, that is, when one of these
 .. math:: |q_r - q|/e_{max},\; |\dot q|/\dot q_{max},\; |\delta|/\delta_{max},\; |\varepsilon|/\varepsilon_{max},\;
           t_{saturated}/t_{max}
 
-and, for the joints' range with braking distance, :math:`q + \dot q|\dot q|/2D`. D is the deceleration that the torque
-limit of the joint allows a straight arm, or the largest acceleration of the motion that is followed, if that is larger:
-its torque was judged on receipt, with the other joints' torques and in its own configurations. While a joint follows a
-motion that brakes, :math:`\dot q_r^2 \le 2D|q_{end} - q_r|`, so that a motion within the range is not stopped.
+The range of the joints is checked with braking distance, by :math:`q + \dot q|\dot q|/2D`. D is the deceleration that
+the torque limit of the joint allows a straight arm, or the largest acceleration of the followed motion, if that is
+larger: its torque was checked on receipt, with the other joints' torques and in its own configurations. While a joint
+follows a motion that brakes, :math:`\dot q_r^2 \le 2D|q_{end} - q_r|`, so a motion within the range is not stopped.
 
 A ratio above `FAULT_RATIO` is a fault, and so is a limit that stays exceeded for `limit_patience`, or a state that
 can't be trusted.
@@ -44,44 +45,44 @@ STOP_FRACTION = 0.5
 
 PARAMETERS = (
     parameter("tracking_error_limit", 0.5, "rad", 0.0, 100.0).described(
-        "Largest distance of a joint from its reference; beyond it the arm is stopped. 0.0: none."
+        "Largest distance of a joint from its reference; beyond it the arm is stopped. 0.0: no limit."
     ),
     parameter("velocity_margin", 1.2, "-", 0.0, 100.0).described(
-        "Largest measured joint velocity, as a multiple of the arm file's limits.velocity; 0.0: none."
+        "Largest measured joint velocity, as a multiple of the arm file's limits.velocity; 0.0: no limit."
     ),
     parameter("position_margin", 0.05, "rad", 0.0, 10.0).described(
-        "How far a joint may come out of the arm file's limits.position, braking distance included; 0.0: not watched."
+        "How far a joint may leave the arm file's limits.position, braking distance included; 0.0: not watched."
     ),
     parameter("deflection_limit", [0.0], "m, rad", 0.0, 1e3, length="modes").described(
-        "Largest modal amplitude, per mode; 0.0: none."
+        "Largest modal amplitude, per mode; 0.0: no limit."
     ),
     parameter("strain_limit", 0.0, "-", 0.0, 1.0).described(
-        "Largest strain that the deflections put on a gauge; 0.0: the gauge's full_scale in the arm file."
+        "Largest strain that the deflections cause at a gauge; 0.0: the gauge's full_scale in the arm file."
     ),
     parameter("saturation_time", 2.0, "s", 0.0, 1e4).described(
-        "Longest time that a torque may stay at its limit; then the arm is stopped. 0.0: any."
+        "Longest time that a torque may stay at its limit; then the arm is stopped. 0.0: no limit."
     ),
     parameter("limit_patience", 1.0, "s", 0.0, 1e3).described(
-        "A limit that stays exceeded for so long, in spite of the stop, is a fault."
+        "A limit that stays exceeded for this long, in spite of the stop, is a fault."
     ),
     parameter("max_gap", 0.5, "s", 1e-3, 1e4).described(
-        "Longest time between the stamps of two states; a fault beyond it."
+        "Longest time between the stamps of two states; a longer one is a fault."
     ),
     parameter("synchronised_clocks", False, read_only=True).described(
-        "Whether stamps are of this machine's clock: then a state's age is judged, else its order alone."
+        "Whether stamps are times of this machine's clock. If so, a state's age is checked, otherwise only its order."
     ),
     parameter("max_age", 0.1, "s", 1e-4, 1e3).described(
-        "With synchronised_clocks: an older state, or one so far from the future, is a fault."
+        "With synchronised_clocks, a state that is older than this, or this far in the future, is a fault."
     ),
     parameter("stop_deceleration", [0.0], "rad/s^2", 0.0, 1e5, length="joints").described(
-        "Largest deceleration by which a smooth stop slows a motion down, per joint; 0.0: what keeps the arm to"
-        " about the motion's own acceleration and jerk."
+        "Largest deceleration of a smooth stop, per joint; 0.0: one that keeps to about the motion's own acceleration"
+        " and jerk."
     ),
 )
 
 
 class State(IntEnum):
-    """As in CompositeState."""
+    """State of the controller, as in CompositeState."""
 
     INACTIVE = 0
     READY = 1
@@ -91,7 +92,7 @@ class State(IntEnum):
     FAULT = 5
 
 
-#: With torque: from the first to the last of these.
+#: First and last of the states with torque.
 FIRST_RUNNING, LAST_RUNNING = State.READY, State.STOPPING
 
 
@@ -105,7 +106,7 @@ class Supervisor:
     settings : mapping
         Checked values of `PARAMETERS`.
     torque_limit : ndarray, shape (n,)
-        Active [N m]; infinite where there is none.
+        Active limits [N m]; infinite where there is none.
 
     Attributes
     ----------
@@ -113,16 +114,16 @@ class Supervisor:
     reason : str
         Why there is no torque, or why the arm was stopped; empty otherwise.
     stops, faults : int
-        How many there have been.
+        Numbers of stops and faults so far.
     deceleration : ndarray, shape (n,)
-        Of a smooth stop [rad/s^2]: asked for, or half of what the torque limit allows.
+        Deceleration of a smooth stop [rad/s^2]: the parameter, or half of what the torque limit allows.
     deceleration_given : ndarray, shape (n,), bool
-        Whether it was asked for.
+        Whether the parameter gives it.
 
     Raises
     ------
     ParameterError
-        For a strain limit on an arm without gauges.
+        If there is a strain limit for an arm without gauges.
     """
 
     def __init__(self, model, settings, torque_limit):
@@ -151,7 +152,7 @@ class Supervisor:
         self.configure(settings, torque_limit)
 
     def configure(self, settings, torque_limit):
-        """Take new limits whole, or raise and keep the old ones."""
+        """Take all new limits, or raise an error and keep the old ones."""
         arm = self.model.arm
 
         def or_none(values):
@@ -195,12 +196,12 @@ class Supervisor:
         self.deceleration_given = wanted > 0.0
 
     def expect(self, acceleration):
-        """The motion that is followed has these largest accelerations, (n,) [rad/s^2]: the arm can brake so, too."""
+        """Take the largest accelerations of the followed motion, (n,) [rad/s^2]: the arm can brake with them, too."""
         self._of_motion = acceleration
         self._ranges[:, 2] = np.maximum(self._able, acceleration)[: len(self._ranges)]
 
     def forget(self):
-        """No limit has been exceeded so far."""
+        """Forget for how long limits have been exceeded."""
         self._exceeded_for = self._saturated_for = 0.0
 
     # Transitions -----------------------------------------------------------------------------
@@ -211,7 +212,7 @@ class Supervisor:
         return FIRST_RUNNING <= self.state <= LAST_RUNNING
 
     def wait(self, reason):
-        """No torque, until the next valid state; a fault stays one."""
+        """Give no torque until the next valid state; a fault stays a fault."""
         if self.state != State.FAULT:
             self.state, self.reason = State.INACTIVE, reason
         self.forget()
@@ -224,11 +225,11 @@ class Supervisor:
         self.forget()
 
     def doubt(self, reason):
-        """The state can't be trusted: a fault where there was torque, else none yet."""
+        """Note that the state can't be trusted: a fault if there was torque, otherwise no torque yet."""
         self.fail(reason) if self.running else self.wait(reason)
 
     def recover(self):
-        """Leave a fault; whether there was one."""
+        """Leave a fault; returns whether there was one."""
         if self.state != State.FAULT:
             return False
         self.state, self.reason = State.INACTIVE, ""
@@ -236,17 +237,17 @@ class Supervisor:
         return True
 
     def begin(self):
-        """The first torque: a valid state and a converged observer."""
+        """Begin with torque: there are a valid state and a converged observer."""
         self.state, self.reason = State.READY, ""
         self.forget()
 
     def stop(self, reason):
-        """A smooth stop begins; the caller brakes the reference."""
+        """Begin a smooth stop; the caller brakes the reference."""
         self.state, self.reason = State.STOPPING, reason
         self.stops += 1
 
     def follow(self, reference):
-        """The state that the reference is in."""
+        """Set the state from that of the reference."""
         if reference.stopping:
             self.state = State.STOPPING
         elif reference.active:
@@ -259,7 +260,7 @@ class Supervisor:
     # Limits ----------------------------------------------------------------------------------
 
     def watch(self, q, qd, amplitude, error, saturated, dt):
-        """Judge one sample; the control path.
+        """Judge one sample; runs on the control path.
 
         Parameters
         ----------
@@ -268,7 +269,7 @@ class Supervisor:
         amplitude : ndarray, shape (m,)
             [m, rad]
         error : ndarray, shape (n,) or None
-            Reference minus position [rad]; None where no law holds the joints to it.
+            Reference minus position [rad]; None if no law holds the joints to it.
         saturated : bool
             Whether a torque was at its limit.
         dt : float
@@ -306,7 +307,7 @@ class Supervisor:
         return State.STOPPING, text
 
     def _text(self, i):
-        """What limit was exceeded."""
+        """Text that names the exceeded limit."""
         (name, unit), value, limit = self._names[i], self._value[i], self._limit[i]
         if name.startswith("position"):
             return (
@@ -316,11 +317,11 @@ class Supervisor:
 
 
 def _deceleration(model, torque_limit):
-    """What the torque limits can brake a straight arm with, (n,) [rad/s^2]; infinite where there is no limit."""
+    """Deceleration that the torque limits allow a straight arm, (n,) [rad/s^2]; infinite where there is no limit."""
     n = model.n_joints
     a, B = slow_subsystem(model.terms(np.zeros(n), np.zeros(n)))
     most = np.diag(B) * torque_limit
-    # What gravity takes of it; a fifth is left in any case.
+    # Gravity takes some of it; at least a fifth is left.
     return np.maximum(most - np.abs(a), 0.2 * most)
 
 

@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How long after a state's stamp the torque that answers it acts, from the torques that the driver reports.
+r"""Measures how long after a state's stamp the torque that answers it acts, from the torques that the driver reports.
 
 A driver reports the mean torque over the interval that ends at a sample's stamp. With u_j the answer to sample j, held
 until the next one acts, and a delay of (k + f) periods, 0 <= f < 1, it reports at sample j + 1
 
 .. math:: r_{j+1} = (1 - f)\,u_{j-k} + f\,u_{j-k-1} .
 
-Over a block of samples, f follows for each k by least squares, and the k with the smallest rest is the delay. To a
-state that was lost there is no answer: the torque before it goes on. A torque that hardly changes says nothing about
-the delay; nor does one that fits no k. A driver that reports the torque at the stamp, and not the mean before it, makes
-the delay look shorter by up to a period.
+Over a block of samples, f follows for each k by least squares, and the k with the smallest residual is the delay. A
+lost state has no answer, so the torque before it goes on. A torque that hardly changes does not show the delay, nor
+does one that fits no k. If a driver reports the torque at the stamp, and not the mean before it, the delay looks
+shorter by up to a period.
 """
 
 import numpy as np
 
-#: Longest delay that is looked for, in periods; samples in a block; and periods that are remembered.
+#: Longest delay that is considered, in periods; samples in a block; and periods that are remembered.
 LAGS, BLOCK, SENT = 32, 16, 128
-#: Largest rest, over what the torque changes from sample to sample, both as sums of squares [-].
+#: Largest residual, over the change of the torque from sample to sample, both as sums of squares [-].
 FITS = 0.5
 #: Smallest change of the torque from sample to sample, over its size [-].
 CHANGES = 1e-8
-#: Periods that differ by more than this fraction belong to no block [-].
+#: Periods that differ by more than this fraction do not belong to one block [-].
 SAME = 0.2
 
 
@@ -30,14 +30,14 @@ class TorqueDelay:
     Parameters
     ----------
     n : int
-        Joints.
+        Number of joints.
 
     Attributes
     ----------
     delay : float
-        Of the last block that shows one [s]; NaN before the first.
+        Delay of the last block that shows one [s]; NaN before the first.
     count : int
-        Blocks that have shown one.
+        Number of blocks that have shown a delay.
     """
 
     def __init__(self, n):
@@ -51,7 +51,7 @@ class TorqueDelay:
         self.begin()
 
     def begin(self):
-        """After an interruption: what was sent before it is no measure."""
+        """Begin after an interruption; torques sent before it do not count."""
         self._now = self._size = 0
 
     def note(self, torque):
@@ -65,11 +65,11 @@ class TorqueDelay:
         Parameters
         ----------
         reported : ndarray, shape (n,)
-            Torque applied since the sample before [N m].
+            Torque applied since the previous sample [N m].
         count : int
-            Periods since the last sample that came.
+            Number of periods since the last sample that came.
         period : float
-            [s]
+            Length of a period [s].
         """
         if not abs(period - self._period) <= SAME * self._period:
             self._period = period
@@ -84,7 +84,7 @@ class TorqueDelay:
         self._size += 1
 
     def judge(self):
-        """Take the delay from a block that is whole, if it shows one; call once the torque is sent."""
+        """Take the delay from a complete block, if it shows one; call once the torque is sent."""
         if self._size < BLOCK:
             return
         self._size = 0

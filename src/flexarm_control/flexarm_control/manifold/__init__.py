@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slow manifolds: where the deflections belong while the slow motion goes on. One manifold per file."""
+"""Slow manifolds, which give the deflections that belong to the slow motion; one manifold per file."""

@@ -11,12 +11,12 @@ from flexarm_dynamics.linear import jacobian
 from ..component import Component, at_rest
 from .expansion import expand, reach, step
 
-#: Step of the differences by which the response to a tracking error is found [rad], [rad/s].
+#: Step of the finite differences that give the response to a tracking error [rad], [rad/s].
 SMALL = 1e-5
 
 
 def around(reference, step, out):
-    """Fill `out`, (p, 3, n), with a reference's states at p offsets, `step` [s] apart; that of the middle one is 0."""
+    """Fill `out`, (p, 3, n), with a reference's states at p offsets, `step` [s] apart; the middle one is 0."""
     if hasattr(reference, "around"):
         reference.around(step, out)
         return
@@ -26,7 +26,7 @@ def around(reference, step, out):
 
 
 class Manifold(Component, ABC):
-    """Deflections z_bar that go with the slow motion, and the torque that goes with them beyond the slow law's.
+    """Deflections z_bar that belong to the slow motion, and the torque that they need beyond the slow law's.
 
     A manifold is registered by name in the entry-point group ``flexarm.manifolds``. The fast control acts on
     z_f = z - z_bar, so that it does nothing on the manifold: the constraint of (12).
@@ -34,9 +34,9 @@ class Manifold(Component, ABC):
     Parameters
     ----------
     model : ArmModel
-        The arm; its terms are taken from the slow law's, which may have learnt.
+        The arm; its terms come from the slow law's model, which may have learnt.
     slow : SlowLaw
-        Whose motion the deflections go with.
+        Law whose motion the deflections belong to.
     parameters : dict
         Checked values of `PARAMETERS`.
 
@@ -48,7 +48,7 @@ class Manifold(Component, ABC):
         Torque beyond the slow law's [N m].
     """
 
-    #: Order in mu to which the deflections follow the motion.
+    #: Order in mu up to which the deflections follow the motion.
     order = 0
 
     def __init__(self, model, slow, parameters):
@@ -59,7 +59,7 @@ class Manifold(Component, ABC):
         self.feedforward = np.zeros(n)
 
     def of(self, model):
-        """The same manifold of another model of the arm, with more modes; for `along` alone."""
+        """The same manifold for another `model` of the arm, with more modes; use it for `along` only."""
         if model is self.model:
             return self
         other = copy(self)
@@ -68,31 +68,32 @@ class Manifold(Component, ABC):
 
     @abstractmethod
     def update(self, q, qd, reference, terms, slow_torque):
-        """Fill `amplitude`, `rate` and `feedforward`; the control path.
+        """Fill `amplitude`, `rate` and `feedforward`; runs on the control path.
 
         Parameters
         ----------
         q, qd : ndarray, shape (n,)
             Joint position [rad] and velocity [rad/s].
         reference : object
-            With `position`, `velocity`, `acceleration`, each (n,), and ``near(offset)``: the three, (3, n), at an
-            offset [s] from now.
+            With `position`, `velocity`, `acceleration`, each (n,), and ``near(offset)``, which gives the three, (3, n),
+            at an offset [s] from now.
         terms : Terms
-            Of (2) at (q, qd), without deflections.
+            Terms of (2) at (q, qd), without deflections.
         slow_torque : ndarray, shape (n,)
-            The slow law's [N m].
+            Torque of the slow law [N m].
         """
 
     def along(self, reference):
         """The manifold of the `reference` itself, without tracking error: amplitude, rate and torque.
 
-        (m,) [m, rad], (m,) [m/s, rad/s], and of the whole motion, from the joint rows of (2), (n,) [N m].
+        They are (m,) [m, rad], (m,) [m/s, rad/s] and (n,) [N m]. The torque is that of the whole motion, from the joint
+        rows of (2).
         """
         found = self._of_reference(reference)
         return found.delta, found.rate, found.torque
 
     def _of_reference(self, reference):
-        """The `Expansion` of the reference at present."""
+        """The `Expansion` of the reference at the present time."""
         motions = np.empty((2 * reach(self.order) + 1, 3, self.model.n_joints))
         around(reference, step(self.order), motions)
         return expand(self.model.terms_along(motions), motions[:, 2], self.order)
@@ -100,7 +101,7 @@ class Manifold(Component, ABC):
     def error_response(self, q):
         """How a tracking error moves the manifold and its feed-forward, linearised at rest in q.
 
-        L, the derivative of z_bar by (q, qd), (2m, 2n), and U, that of the feed-forward, (n, 2n).
+        Returns L, (2m, 2n), and U, (n, 2n), the derivatives of z_bar and of the feed-forward with respect to (q, qd).
         """
         n, m = self.model.n_joints, self.model.n_modes
         reference = at_rest(q)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""The integral manifold of the slow motion, to any order in mu.
 
-On the slow manifold the arm moves as the slow law wants it, :math:`\ddot q_s = a + B\bar u`, and the deflections
-with it. The modal rows of (2) along that motion,
+On the slow manifold the joints move as the slow law requires, :math:`\ddot q_s = a + B\bar u`, and the deflections
+move with them. The modal rows of (2) along that motion,
 
 .. math:: M_{21}\ddot q_s + M_{22}\ddot\delta + f_2 + C_2\dot\delta + K_2\delta = 0,
 
-have one solution that does not vibrate. K_2 is large as 1/mu^2, so that it comes from the fixed point
+have one solution that does not vibrate. K_2 is of order 1/mu^2, so this solution is the limit of the iteration
 
 .. math::
     \delta^{(0)} &= -K_2^{-1}(M_{21}\ddot q_s + f_2), \qquad \dot\delta^{(0)} = 0 \\
@@ -14,15 +14,15 @@ have one solution that does not vibrate. K_2 is large as 1/mu^2, so that it come
     \delta^{(k+1)} &= \delta^{(0)} - K_2^{-1}\bigl(M_{22}\tfrac{d}{dt}\dot\delta^{(k)} + C_2\dot\delta^{(k)}\bigr),
 
 the expansion of the integral manifold (Sobolev 1984; Spong, Khorasani & Kokotovic 1987 for flexible joints) in
-z = (delta, delta_d). Order 0 is the paper's (9), order 1 adds the rates, order 2 the inertia of the bending; what
-is left out is of order mu^(k+1). With the joint rows of (2) the joints then move as the slow law wants:
+z = (delta, delta_d). Order 0 is the paper's (9), order 1 adds the rates, order 2 the inertia of the bending; the
+error is of order mu^(k+1). The joint rows of (2) give the torque with which the joints move as the slow law requires:
 
 .. math:: u = \bar u + M_{12}\ddot\delta + C_1\dot\delta + K_1(\delta - \delta^{(0)}) .
 
 The derivatives are taken along the slow motion through the present state, by central differences over
 `expansion.step`. The reference is known, and under the slow law the tracking error decays by
-:math:`\ddot e = -k_v\dot e - k_p e`. So the manifold holds off the reference, too, and the slow poles stay where they
-were placed. docs/control.md has the derivation, beside a manifold found numerically.
+:math:`\ddot e = -k_v\dot e - k_p e`. So the manifold is valid off the reference, too, and the slow poles stay where
+they were placed. docs/control.md has the derivation, and compares with a manifold found numerically.
 """
 
 import numpy as np
@@ -40,7 +40,7 @@ class CorrectedManifold(Manifold):
     PARAMETERS = (
         parameter("order", 2, "-", 0, 6).described(
             "Order of the corrected manifold in mu: 0 is the paper's, 1 adds the rates of the deflections, 2 their"
-            " inertia; each two more take two more derivatives of the reference."
+            " inertia; every two orders more need two more derivatives of the reference."
         ),
     )
 
@@ -51,7 +51,7 @@ class CorrectedManifold(Manifold):
         self._flow = self._error_flow()
 
     def _error_flow(self):
-        """Tracking error (e, de/dt) at each point of the stencil from that now; None without a linear law."""
+        """Matrices from the tracking error (e, de/dt) now to that at each stencil point; None without a linear law."""
         gains = self.slow.error_gains()
         if gains is None:
             return None
@@ -80,7 +80,7 @@ class CorrectedManifold(Manifold):
         """Position, velocity, acceleration of the slow motion at a point of the stencil, (3, n)."""
         motion, t, n = reference.near(j * self._step).copy(), j * self._step, self.model.n_joints
         if self._flow is None:
-            # A law of another kind: what it adds to the reference's acceleration is taken as constant.
+            # For another kind of law, the acceleration that it adds to the reference's is taken as constant.
             motion[0] += -error[:n] - t * error[n:] + 0.5 * t * t * extra
             motion[1] += -error[n:] + t * extra
             motion[2] += extra
@@ -94,7 +94,7 @@ class CorrectedManifold(Manifold):
 
 
 def slow_acceleration(terms, slow_torque):
-    """The slow subsystem's acceleration (10), from the joint rows of (2) with the modes at rest, shape (n,)."""
+    """Acceleration of the slow subsystem (10), from the joint rows of (2) with the modes at rest, shape (n,)."""
     M, n = terms.M, terms.n
     if not terms.K1.any():
         return np.linalg.solve(M[:n, :n], slow_torque - terms.f1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of the slow motion's deflections by central differences: what every manifold's orders are made of."""
+"""Expansion of the slow motion's deflections in mu by central differences, which every manifold uses."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from .. import kernels
 def step(order):
     """Step of the central differences [s].
 
-    For a motion of a second their error is at most 1e-6, and rounding is less. From order 3 on differences are taken of
-    differences: a longer step then keeps rounding small.
+    For a motion of a second their error is at most 1e-6, and the rounding error is smaller. From order 3 on,
+    differences of differences are taken; a longer step then keeps the rounding error small.
     """
     return 1e-3 if order <= 2 else 4e-3
 
 
 def reach(order):
-    """Points of the stencil on either side that an order takes."""
+    """Number of stencil points on either side that an order needs."""
     return (order + 1) // 2
 
 
@@ -28,11 +28,11 @@ class Expansion(NamedTuple):
     Attributes
     ----------
     delta, rate, second : ndarray, shape (m,)
-        Deflection, and its derivatives by time.
+        Deflection and its time derivatives.
     torque : ndarray, shape (n,)
-        Of the whole motion, from the joint rows of (2) [N m].
+        Torque of the whole motion, from the joint rows of (2) [N m].
     beyond : ndarray, shape (n,)
-        Of the bending beyond order 0 [N m].
+        Torque of the bending beyond order 0 [N m].
     """
 
     delta: np.ndarray
@@ -48,12 +48,12 @@ def expand(terms, accelerations, order):
     Parameters
     ----------
     terms : Terms
-        Of (2) without deflections, at the points of the slow motion, `step` apart, with a leading axis; `reach` on
-        either side.
+        Terms of (2) without deflections. The leading axis counts points of the slow motion, `step` apart, with `reach`
+        of them on either side.
     accelerations : ndarray, shape (p, n)
-        Of the joints [rad/s^2].
+        Accelerations of the joints [rad/s^2].
     order : int
-        In mu.
+        Order in mu.
     """
     t, centre = terms, len(terms.M) // 2
     out, torque = np.empty((3, t.f2.shape[1])), np.empty((2, t.f1.shape[1]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Excitation by a motion: the linear response of the fast subsystem (11) along it.
+r"""Excitation by a motion: the linear response of the fast subsystem (11) along the motion.
 
 The slow torque of the motion is that of the reduced model (10), :math:`\bar u = B^{-1}(\ddot q - a)`; with it the
 deflections have the quasi-steady state :math:`\bar\delta` (9). The deviation :math:`z_f = z - \bar z` follows
@@ -9,7 +9,7 @@ deflections have the quasi-steady state :math:`\bar\delta` (9). The deviation :m
 
 with :math:`A_2` along the motion, or at one configuration. It is measured by its energy,
 :math:`E = \frac12\delta_f^T K\delta_f + \frac12\dot\delta_f^T H_{22}^{-1}\dot\delta_f` (joints free), which
-treats metres and radians of all modes alike. There is no fast control here: the energy is what it has to remove.
+treats metres and radians of all modes alike. There is no fast control here; it would have to remove this energy.
 """
 
 from dataclasses import dataclass
@@ -57,9 +57,9 @@ def along(model, profile, configuration=None, points=801) -> Excitation:
     model : ArmModel
     profile : Motion
     configuration : (n,) array_like, optional
-        Where (11) is taken [rad]; along the motion if not given.
+        Configuration at which (11) is taken [rad]; along the motion if not given.
     points : int
-        Of time; the quasi-steady state is linear between them.
+        Number of points of time; the quasi-steady state is linear between them.
     """
     times = np.linspace(0.0, profile.duration, points)
     q, qd, qdd = profile.states(times)
@@ -85,13 +85,13 @@ def reduced(model, q, qd, qdd):
 class FastResponse:
     """The response of (11) to a quasi-steady state that moves, on a grid of time.
 
-    Exact for a state that is linear between the grid's points and an A2 that is constant there.
+    It is exact for a state that is linear between the grid's points and an A2 that is constant there.
 
     Parameters
     ----------
     model : ArmModel
     step : float
-        Of the grid [s].
+        Step of the grid [s].
     q, qd : (k, n) arrays
         Joint angles and rates at the grid's points [rad], [rad/s]; one row stands for all.
     """
@@ -135,7 +135,7 @@ class FastResponse:
         return out
 
     def weighed(self, deviation):
-        """Deviations (k, 2m, c) such that E is half of their square, (k, 2m, c)."""
+        """Deviations (k, 2m, c), weighed such that E is half of their square, (k, 2m, c)."""
         steps = np.minimum(np.arange(deviation.shape[0]), len(self.root) - 1)
         return self.root[steps] @ deviation
 

@@ -62,7 +62,7 @@ class ExcitationRun:
     reason : str
         Why it was stopped; empty otherwise.
     torque : ndarray, shape (n,)
-        Of the last sample [N m]; zero when not enabled.
+        Torque of the last sample [N m]; zero when not enabled.
     """
 
     def __init__(self, model, settings):

@@ -65,14 +65,14 @@ class ExcitationTorque:
     Attributes
     ----------
     duration : float
-        Of the whole torque [s].
+        Duration of the whole torque [s].
     hold : ndarray, shape (n,)
         Torque that holds the arm's weight [N m].
 
     Raises
     ------
     ParameterError, DesignError
-        For an unknown joint, an amplitude beyond the joint's limit, and a sweep whose end is not above its start.
+        If a joint is unknown, an amplitude is beyond the joint's limit, or a sweep's end is not above its start.
     """
 
     def __init__(self, model, settings: Mapping, position=None):
@@ -116,7 +116,7 @@ class ExcitationTorque:
         return out
 
     def _shape(self, t):
-        """Torque of one joint, of its amplitude [-]."""
+        """Torque of one joint, as a fraction of its amplitude [-]."""
         T, kind = self.shaking, self.settings["kind"]
         if t >= T:
             return 0.0
@@ -137,7 +137,7 @@ def _joints(model, name):
 
 
 def _amplitude(joint, wanted, hold):
-    """Amplitude of a joint, within what its limit leaves beside the weight [N m]."""
+    """Amplitude of a joint, within what its limit leaves after the weight [N m]."""
     left = joint.limits.torque - abs(hold)
     if not wanted:
         if not np.isfinite(left):

@@ -7,8 +7,8 @@ degree five with rest and no jerk at both ends, whose coefficients x are found b
 .. math:: \min_x\; \frac{w\,E(T) + \frac1T\int_0^T E\,dt}{E_5} + \epsilon\,\frac{\int\dddot\sigma^2dt}{J_5}
     \quad\text{with}\quad |\bar u_i(t)| \le u_{i,max},\; 0 \le |\Delta_i|\,\dot\sigma(t) \le v_{i,max},
 
-E the energy of the deviation from the quasi-steady state that the fast subsystem (11) has along the motion,
-linear in x before it is squared (`excitation`); :math:`E_5, J_5` those of a quintic of the same duration. The torque
+E is the energy of the deviation from the quasi-steady state that the fast subsystem (11) has along the motion. The
+deviation is linear in x (`excitation`). :math:`E_5, J_5` are those of a quintic of the same duration. The torque
 :math:`\bar u` of (10) and the quasi-steady state (9) are linearised along the last solution, and the programme is
 solved again until it no longer changes (sequential convex programming). For one joint without gravity and friction
 a single solution is exact, except for the effect of the joint's rate on the stiffness.
@@ -30,7 +30,7 @@ from .profiles import Profile, quintic
 
 #: Pieces of the spline. Points at multiples of T / INTERVALS make the sampled motion exact.
 INTERVALS = 25
-#: Times per piece at which limits are enforced and the response is computed.
+#: Number of times per piece at which limits are enforced and the response is computed.
 PER_INTERVAL = 6
 _DEGREE = 5
 _REST = 4  # coefficients at either end, fixed by rest without jerk
@@ -71,17 +71,17 @@ def least_exciting(
     duration : float
         T [s].
     torque_limit, velocity_limit : (n,) array_like, optional
-        Of the slow torque [N m] and of the speeds [rad/s]; the arm file's limits if not given. Leave some
+        Limits of the slow torque [N m] and of the speeds [rad/s]; the arm file's if not given. Leave some
         torque for the fast control.
 
     Raises
     ------
     TrajectoryError
-        If no time law stays within the limits; with the least torque and the least duration that would do.
+        If no time law stays within the limits; it names the least torque and the least duration that would do.
     DesignError
         If the programme does not settle.
     ShapeError
-        For limits of another length.
+        If the limits have another length.
     """
     base = quintic(start, end, duration)
     if base.start.shape != (model.n_joints,):

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The shaper that leaves least of several modes whose frequencies are uncertain, in a given time: a linear programme.
+r"""Finds the shaper that leaves least of several modes with uncertain frequencies, in a given time.
 
-Impulses :math:`A_k \ge 0` at equal spacing over the time allowed, :math:`\sum_k A_k = 1`, are chosen so that the
-largest residual V of `shapers` over all frequencies within the spread of any mode is least:
+Impulses :math:`A_k \ge 0` at equal spacing over the time allowed, :math:`\sum_k A_k = 1`, are chosen by a linear
+programme, so that the largest residual V of `shapers` over all frequencies within the spread of any mode is least:
 
 .. math:: \min_{A,\,\epsilon} \epsilon \quad\text{with}\quad
     \mathrm{Re}\,\bigl(e^{-j\varphi} \sum_k A_k e^{\zeta\omega(t_k - t_n)} e^{j\omega_d t_k}\bigr) \le \epsilon
 
 for frequencies close to each other and for directions :math:`\varphi` around the circle, whose polygon is V to
-1 - cos(pi / `DIRECTIONS`). At each mode's own frequency V is :math:`\epsilon` times `AT_DESIGN` at most. Such minimax
-designs in place of several conditions are due to Singhose, Seering & Singer (1994) for one mode; as linear
-programmes, Singh (2008), *Minimax input shaper design using linear programming*.
+1 - cos(pi / `DIRECTIONS`). At each mode's own frequency V is at most :math:`\epsilon` times `AT_DESIGN`. Such minimax
+designs instead of several conditions are due to Singhose, Seering & Singer (1994) for one mode, and as linear
+programmes to Singh (2008), *Minimax input shaper design using linear programming*.
 """
 
 import numpy as np
@@ -20,12 +20,12 @@ from flexarm_dynamics.errors import DesignError
 
 from .shapers import Shaper, half_period
 
-#: Impulses over the whole time, frequencies over the spread of a mode, directions around the circle.
+#: Numbers of impulses over the whole time, frequencies over the spread of a mode, and directions around the circle.
 IMPULSES, FREQUENCIES, DIRECTIONS = 65, 13, 16
 #: V at a mode's own frequency, over the largest V within its spread [-].
 AT_DESIGN = 0.3
-#: A linear programme is given up after so many iterations, some 100 are usual: a count, so that a busy computer finds
-#: the same shaper.
+#: A linear programme is given up after this many iterations; some 100 are usual. This is a count, so that a busy
+#: computer finds the same shaper.
 ITERATIONS = 10_000
 #: Impulses below this fraction are left out [-].
 NEGLIGIBLE = 1e-6
@@ -41,9 +41,9 @@ def robust(frequencies, dampings, spread, periods) -> Shaper:
     dampings : (m,) array_like
         Damping ratios, at least 0 and below 1 [-].
     spread : float
-        By which fraction the frequencies may be off [-].
+        Fraction by which the frequencies may be off [-].
     periods : float
-        How long the shaper may be, in damped periods of the lowest mode [-].
+        Largest length of the shaper, in damped periods of the lowest mode [-].
 
     Raises
     ------

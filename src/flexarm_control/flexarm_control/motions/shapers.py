@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Input shapers: a motion becomes delayed copies of itself; what one copy excites, the next cancels.
+r"""Input shapers: they make a motion the sum of delayed copies of itself, so that each cancels what others excite.
 
-In a mode :math:`\omega,\zeta` at rest before, an impulse train :math:`\sum_i A_i\,\delta(t-t_i)`,
+In a mode :math:`\omega,\zeta` that was at rest, an impulse train :math:`\sum_i A_i\,\delta(t-t_i)`,
 :math:`\sum A_i = 1`, leaves after its last impulse :math:`t_n` the fraction
 
 .. math:: V(\omega,\zeta) = e^{-\zeta\omega t_n}\sqrt{C^2 + S^2},\quad
@@ -27,11 +27,11 @@ Any motion convolved with the train leaves the same fraction of its own vibratio
   proportional to (1, cK, cK^2, K^3), :math:`c = 1 + 2\cos\varphi`. Without damping
   :math:`V = |T_3(x_0\cos\frac{\omega T}{4})| / T_3(x_0)`, with T_3 the Chebyshev polynomial and T the design period,
   which gives :math:`x_0 = \cosh(\frac13 \mathrm{arcosh}\frac1V)` and :math:`\cos\varphi = 1 - 3/(2x_0^2)`, that is, the
-  published amplitudes. With damping the humps are as high as that only nearly.
+  published amplitudes. With damping the humps have that height only nearly.
 
 For several modes the trains are convolved (Singhose, Seering & Singer 1997). The modes are those of the fast
 subsystem (11), whose input is the slow torque of the motion. While mass matrix and configuration do not change,
-the torque is shaped as the motion is, and V is exact.
+the torque is shaped like the motion, and V is exact.
 """
 
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ from flexarm_dynamics.singular_perturbation import fast_subsystem, frequencies_a
 
 from .profiles import Motion
 
-#: A longer train is refused: every sample of a shaped motion evaluates the motion once per impulse.
+#: A longer train is refused, since every sample of a shaped motion evaluates the motion once per impulse.
 MAX_IMPULSES = 1000
 #: Fraction of the vibration that EI leaves at the design frequency [-].
 EI_RESIDUAL = 0.05
@@ -66,7 +66,7 @@ class Shaper:
 
     @property
     def duration(self):
-        """How much longer it makes a motion [s]."""
+        """Time by which it makes a motion longer [s]."""
         return float(self.times[-1])
 
     def __matmul__(self, other):
@@ -251,7 +251,7 @@ def impulses(kind, frequency, damping) -> Shaper:
 
 
 def convolve(trains) -> Shaper:
-    """Return the convolution of shapers: each takes out its mode, and the delays add up.
+    """Return the convolution of shapers: each removes its mode, and the delays add up.
 
     Parameters
     ----------
@@ -317,11 +317,11 @@ def for_arm(model, q, kind, modes=2) -> Shaper:
     ----------
     model : ArmModel
     q : (n,) array_like
-        Where the motion ends: the vibration that is left is the one there [rad].
+        Configuration where the motion ends, since the remaining vibration is there [rad].
     kind : str
         One of `SHAPERS`, or ``none``.
     modes : int
-        How many of the lowest; at most as many as the arm has.
+        Number of lowest modes; at most as many as the arm has.
 
     Raises
     ------

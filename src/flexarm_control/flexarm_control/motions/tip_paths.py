@@ -66,12 +66,12 @@ def line(model, start, end, law) -> TipPath:
     end : (3,) array_like
         Where it ends, in the base frame [m].
     law : Motion
-        Of one joint, from 0 to 1: the fraction of the path.
+        Motion of one joint, from 0 to 1: the fraction of the path.
 
     Raises
     ------
     TrajectoryError
-        If the path can't be followed to its end; with the fraction that can, and how near the tip comes.
+        If the path can't be followed to its end; it names the fraction that can, and how near the tip comes.
     """
     end, start = checked(model, end, start)
     kinematics = TipKinematics(model)
@@ -160,8 +160,8 @@ def _follow(kinematics, start, curve, law):
     count = _MIN_KNOTS
     while True:
         knots = np.linspace(0.0, 1.0, count + 1)
-        # The path is solved anew from its start: solutions for added points alone could end in another
-        # branch, of an arm with more joints than it needs.
+        # The path is solved again from its start: solutions for added points alone could end in another
+        # branch, if an arm has more joints than it needs.
         angles = _solve_along(kinematics, knots, curve, start)
         joints = make_interp_spline(knots, angles, k=5)
         between = 0.5 * (knots[1:] + knots[:-1])

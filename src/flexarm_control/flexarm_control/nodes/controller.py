@@ -76,7 +76,7 @@ class ControllerNode(ArmNode):
         self._make_topics()
 
     def _default(self, designer):
-        """The `Default` for an arm without laws, once there is one, its parameters adopted; None for one with laws."""
+        """The `Default` for an arm without laws, with its parameters adopted; None for an arm with laws."""
         parameters, arm = self.parameters, self.arm
         if not is_wanted(parameters["arm"], parameters.given, parameters["design.type"]):
             return None
@@ -86,7 +86,7 @@ class ControllerNode(ArmNode):
             return default(arm, *wanted, lambda _, *task: designer.find(*task))
 
         if not is_cached(arm, *wanted):
-            designer.start()  # here: it would end with the thread that waits
+            designer.start()  # here, since it would end with the thread that waits
         found = self.wait_for(make, f"designing the control of {arm.name}")
         parameters.adopt(found.parameters)
         return found
@@ -143,7 +143,7 @@ class ControllerNode(ArmNode):
                 self._designs.carry(payload)
 
     def _watch(self):
-        """On the steady clock: notice that the states have stopped."""
+        """Notice, by the steady clock, that the states have stopped."""
         self._ticks += 1
         if self._ticks < 6 or not self._seen or not self.active:
             return
@@ -165,7 +165,7 @@ class ControllerNode(ArmNode):
         return self._state.fill(self._sample, self.core, took, self._designs.last_change)
 
     def _answer_again(self):
-        """Publish torque and controller/state as answers to the last state: they have changed since."""
+        """Publish torque and controller/state again as answers to the last state, since they have changed."""
         self._send(self.core.enabled)
         self._state_pub.publish(self._filled(0.0))
         self._report.log_state()
@@ -212,7 +212,7 @@ class ControllerNode(ArmNode):
     def stop(self):
         self.core.disable("the controller was stopped")
         self._send(False)
-        # A node that ends takes with it what has not been delivered yet.
+        # Messages that are not delivered when a node ends are lost.
         self._torque_pub.wait_for_all_acked(LAST_MESSAGE_TIMEOUT)
 
     def destroy_node(self):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changed parameters of the controller node: applied, after a design where they need one, or set back."""
+"""Applies changed parameters of the controller node, after a design if they need one, or sets them back."""
 
 from collections import deque
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -17,27 +17,28 @@ MAX_PAUSE = 0.2
 
 
 def _difference(values, active):
-    """The values that differ from the active ones, for people."""
+    """Text of the values that differ from the active ones."""
     return ", ".join(f"{k} {v} (was {active[k]})" for k, v in values.items() if v != active[k])
 
 
 class Designs:
     """Applies changed parameters, or sets them back to the active ones.
 
-    Of changes that come faster than designs are made, as from a slider, the newest is designed; where it is refused,
-    the newest one before it that is not. Between two designs the processor is left to the control path for a while.
+    If changes come faster than designs are made, as from a slider, the newest is designed. If it is refused, the newest
+    one before it that is not refused is taken. Between two designs the processor is left to the control path for a
+    while.
 
     Parameters
     ----------
     node : ArmNode
-        With its parameters, whose changes come to `changed`.
+        Node with the parameters; their changes come to `changed`.
     core : ArmController
     designer : Designer
 
     Attributes
     ----------
     last_change : str
-        The last parameters that were set, and what became of them; empty before.
+        The last parameters that were set, and the result; empty before.
     """
 
     def __init__(self, node, core, designer):
@@ -53,7 +54,7 @@ class Designs:
         node.parameters.on_change(self.changed)
 
     def changed(self, names):
-        """Parameters of these names have been set."""
+        """Take note that the parameters of these `names` have been set."""
         if of_limits(dict.fromkeys(names)):
             self._take_limits()
         if of_design(dict.fromkeys(names)):
@@ -76,15 +77,15 @@ class Designs:
             self._limits = limits
 
     def _report(self, values, active):
-        """Tell that values are active now, beside those that were."""
+        """Report that values are active now, and which were before."""
         if values != active:
             self.last_change = f"{_difference(values, active)}: active"
             self._node.get_logger().info(self.last_change)
 
     def _redesign(self):
-        """In the design thread: the new control replaces the old one whole, or the parameters are set back."""
+        """In the design thread: replace the old control as a whole by the new one, or set the parameters back."""
         newest_first = [self._waiting.popleft() for _ in range(len(self._waiting))][::-1]
-        if not newest_first:  # designed for with a newer one
+        if not newest_first:  # taken into account with a newer change
             return
         begun, newest = monotonic(), newest_first[0]
         any(self._designed(values) for values in newest_first)
@@ -120,13 +121,13 @@ class Designs:
         self._node.hand_over(self._node.set_parameters_atomically, old)
 
     def carry(self, payload):
-        """Have the control designed for another payload, in parts of the arm file's, and taken over at rest."""
+        """Have the control designed for another payload, a multiple of the arm file's, and taken over at rest."""
         if not self._carries:
             self._carries = True
             self._thread.submit(self._carry, payload)
 
     def _carry(self, payload):
-        """In the design thread: the control for another payload."""
+        """In the design thread: design the control for another payload."""
         try:
             law = self._designer.design({**self._design, "payload_scale": payload})
         except CancelledError:
@@ -137,7 +138,7 @@ class Designs:
             self._node.hand_over(self._carried, law, payload)
 
     def _carried(self, law, payload, refused=""):
-        """In the node's thread: the control for another payload is there, or why it is refused."""
+        """In the node's thread: take the control for another payload, or the reason why it is refused."""
         self._carries = False
         if refused:
             self._core.payload.discard(f"no control for a payload of {payload:g}: {refused}")

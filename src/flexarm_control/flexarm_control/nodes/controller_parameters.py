@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller node declares, and which of its parameters belong to the limits and which to the design."""
+"""Declared parameters of the controller node, and which of them belong to the limits and which to the design."""
 
 from flexarm_dynamics.parameters import parameter
 from flexarm_ros.node import ARM
@@ -12,11 +12,11 @@ from ..robust import default
 from .trajectory_state import STATE_PUBLISH_RATE
 
 STATE_TIMEOUT = parameter("state_timeout", 0.5, "s", 0.01, 3600.0, read_only=True).described(
-    "Without a state for so long the torque is disabled: a fault."
+    "If no state arrives for this long, the torque is disabled; this is a fault."
 )
 DESIGN_PROCESS = parameter("design_process", True, read_only=True).described(
-    "Whether laws are designed anew, and motions planned, in a process of their own, which takes memory, rather than"
-    " in a thread, which may hold up a sample for some milliseconds."
+    "Whether new designs and plans of motions are made in a separate process, which takes memory, rather than in a"
+    " thread, which may delay a sample by some milliseconds."
 )
 
 #: Names of the parameters that take effect with the next sample.
@@ -36,10 +36,10 @@ def groups():
 
 
 def of_design(values):
-    """Those of flat parameters that a change of the design is about."""
+    """The flat parameters in `values` that belong to the design."""
     return {k: v for k, v in values.items() if k in _DESIGN or k.split(".")[0] in assembly.CONTROL}
 
 
 def of_limits(values):
-    """Those of flat parameters that `ArmController` takes."""
+    """The flat parameters in `values` that `ArmController` takes."""
     return {k: v for k, v in values.items() if k in LIMITS}

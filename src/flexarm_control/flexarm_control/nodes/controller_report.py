@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller node tells its user: the log's lines when the supervisor's state changes, and diagnostics."""
+"""Reports of the controller node to its user: log lines when the supervisor's state changes, and diagnostics."""
 
 from math import isnan
 
@@ -8,7 +8,7 @@ from flexarm_ros.statistics import Latency, Percentiles
 
 from ..loop.supervisor import State
 
-#: States may come at another rate than the design's by this fraction.
+#: Fraction by which the rate of states may differ from the design's.
 OTHER_RATE = 0.2
 
 
@@ -18,10 +18,10 @@ class Report:
     Parameters
     ----------
     node : ArmNode
-        Its log and parameters.
+        Node whose log and parameters are used.
     core : ArmController
     design : Default or None
-        That the control is from; None: its parameters were given.
+        Design of the control; None: its parameters were given.
     """
 
     def __init__(self, node, core, design=None):
@@ -47,7 +47,7 @@ class Report:
             self.log_state()
 
     def log_state(self):
-        """Log the supervisor's state, where a user needs to know it."""
+        """Log the supervisor's state, if a user needs to know it."""
         state, was, reason = self._core.state, self._logged, self._core.supervisor.reason
         self._logged = state
         log = self._node.get_logger()
@@ -112,7 +112,7 @@ class Report:
         }
 
     def _not_as_designed(self, delay):
-        """How the loop differs from that of the design, beyond what the design bears; `delay` is measured [s]."""
+        """How the loop differs from the design's, beyond what the design bears; `delay` is the measured one [s]."""
         design, period = self._design, self._core.period
         if design is None:
             return ""
@@ -149,5 +149,5 @@ class Report:
 
 
 def _milliseconds(time):
-    """A time [s] in milliseconds, for people; a dash where there is none."""
+    """A time [s] in milliseconds, as text; a dash if there is none."""
     return "-" if isnan(time) else f"{1e3 * time:.3f}"

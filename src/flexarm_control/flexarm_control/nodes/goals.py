@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Action servers of the controller: trajectories as goals, with feedback, tolerances, cancelling and results.
 
-A node, and so a process, of its own: rclpy turns a goal of thousands of points into objects in one go, which would
-hold up the control path. It publishes a goal on `joint_trajectory`, and follows it on `controller/state`.
+This is a separate node, and so a separate process: rclpy turns a goal of thousands of points into objects in one go,
+which would delay the control path. It publishes a goal on `joint_trajectory`, and follows it on `controller/state`.
 """
 
 import importlib
@@ -35,16 +35,16 @@ PARAMETERS = (
         "Rate of a goal's feedback (wall time)."
     ),
     parameter("state_timeout", 1.0, "s", 0.05, 3600.0, read_only=True).described(
-        "A goal is aborted when controller/state has not come for so long, or nothing has answered the goal in five"
-        " times as long; a controller that sends its state has sixty times as long to judge a trajectory."
+        "A goal is aborted if controller/state does not arrive for this long, or if nothing answers the goal within"
+        " five times as long. A controller that sends its state has sixty times as long to judge a trajectory."
     ),
 )
-#: Between two looks at the arm, and before a trajectory without an answer is sent again (wall time) [s].
+#: Times between two looks at the arm, and before a trajectory without an answer is sent again (wall time) [s].
 LOOK, AGAIN = 0.01, 1.0
-#: Waits for an answer are so many times longer than for a state: of a silent controller, and of one that sends its
-#: state, since a trajectory's torque is judged first, in a process that may have just been started.
+#: The wait for an answer is this many times longer than for a state: from a silent controller, and from one that sends
+#: its state. The latter first judges a trajectory's torque, in a process that may have just been started.
 PATIENCE, JUDGING = 5.0, 60.0
-#: Beginnings of a refusal that have a number of their own.
+#: Beginnings of refusals that have their own error code.
 REFUSALS = {
     "joint_names": goal.Code.INVALID_JOINTS,
     "header.stamp": goal.Code.OLD_HEADER_TIMESTAMP,
@@ -59,7 +59,7 @@ class Server(ActionServer):
     ----------
     node : Node
     kind : type
-        Of the action.
+        Type of the action.
     name : str
     owner : object
         Has `may_begin`, `may_cancel` and `take`.
@@ -72,10 +72,10 @@ class Server(ActionServer):
         )
 
     def register_execute_callback(self, execute_callback):
-        """There is none: `notify_execute` takes the goal."""
+        """Do nothing, since `notify_execute` takes the goal."""
 
     def notify_execute(self, goal_handle, execute_callback):
-        """A goal has been accepted."""
+        """Take an accepted goal."""
         self._taken(self, goal_handle)
 
     def finish(self, goal_handle, end):
@@ -84,7 +84,7 @@ class Server(ActionServer):
 
 
 class Goal:
-    """A goal on its way: offered to the controller, then followed until an `Outcome`.
+    """A goal under way: offered to the controller, then followed until an `Outcome`.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ class Goal:
     handle : ServerGoalHandle
     tolerances : Tolerances
     message : JointTrajectory
-        What is offered, under a name of its own.
+        The trajectory that is offered, under its own name.
     """
 
     def __init__(self, server, handle, tolerances, message):
@@ -141,7 +141,7 @@ class GoalsNode(ArmNode):
     # Goals in ----------------------------------------------------------------------------------
 
     def may_begin(self, request):
-        """Accept any goal while active: what is wrong with it, its result says in words."""
+        """Accept any goal while active; its result states what is wrong with it."""
         return GoalResponse.ACCEPT if self.active else GoalResponse.REJECT
 
     def may_cancel(self, handle):
@@ -189,7 +189,7 @@ class GoalsNode(ArmNode):
             self._state, self._came = state, now
         if not self._goals:
             return
-        # New ones first: the controller's answer to one is the end of the one before.
+        # New goals first, since the controller's answer to one is the end of the one before.
         for each in sorted(self._goals, key=lambda one: one.check is not None):
             if each in self._goals and (outcome := self._judge(each, state, estimate, now)):
                 self._end(each, outcome)
@@ -319,7 +319,7 @@ class GoalsNode(ArmNode):
 
 
 def kinds():
-    """Types and names of the actions that are served: ours, and that of control_msgs where it is installed."""
+    """Types and names of the actions that are served: our own, and that of control_msgs if it is installed."""
     yield FollowJointTrajectory, "follow_trajectory"
     try:
         yield (
@@ -331,7 +331,7 @@ def kinds():
 
 
 def refuse_what_is_not_served(request):
-    """Refuse fields of a `request` that no arm of ours has: those of joints with several degrees of freedom.
+    """Refuse fields of a `request` that no arm here has: those of joints with several degrees of freedom.
 
     Raises
     ------

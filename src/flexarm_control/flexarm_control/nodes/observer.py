@@ -23,7 +23,7 @@ from ..robust import default
 from .observer_statistics import ObserverStatistics
 
 RATE = replace(default.RATE, read_only=True).described(
-    "Samples per second that the driver or simulator sends: the controller's parameter of this name."
+    "Samples per second that the driver or simulator sends, as the controller's parameter of this name."
 )
 
 
@@ -70,7 +70,7 @@ class ObserverNode(ArmNode):
         return assembly.observer(self.model, assembly.chosen("observer", self.parameters.values()))
 
     def _changed(self, names):
-        """Replace the observer by a new one, which continues from the old one's estimate."""
+        """Replace the observer by a new one that continues from the old one's estimate."""
         self.core.settings = self.parameters.group("observer.", arm_observer.PARAMETERS)
         if names - {"observer." + name for name in self.core.settings}:
             observer = self._new_core().observer
@@ -102,7 +102,7 @@ class ObserverNode(ArmNode):
             self.report(f"arm_state {msg.sequence}: {error}")
             self._forward_distrusted(self._states.message(raw), str(error))
             return
-        if known is None:  # older than the last one: useless for the controller
+        if known is None:  # older than the last one, and useless for the controller
             return
         if sample.doubt:
             self.report(f"arm_state: {sample.doubt}")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observer and controller in one process: the estimate reaches the controller by a call, not by a message.
 
-The two nodes are those of `observer` and `controller`, with their names, parameters, services and topics; only
-`arm_state_estimate` is not subscribed to any more. It is published after the torque, if it has subscribers.
+The two nodes are those of `observer` and `controller`, with their names, parameters, services and topics. Only the
+subscription to `arm_state_estimate` is missing. The topic is published after the torque, if it has subscribers.
 """
 
 from flexarm_ros.node import run
@@ -29,7 +29,7 @@ class CalledController(ControllerNode):
             super().make_control_path(subscription, *args, **kwargs)
 
     def take(self, message):
-        """An estimate; replaced by the control path once the node is configured."""
+        """Take an estimate; the control path replaces this method once the node is configured."""
 
 
 class Handover:

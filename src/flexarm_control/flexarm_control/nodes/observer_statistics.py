@@ -49,7 +49,7 @@ class ObserverStatistics:
     def diagnose(self, core, name, active):
         """Level, message and values of the last second; `core` is the `ArmObserver`, whose observer has this `name`.
 
-        `active` says whether the node is.
+        `active` is whether the node is active.
         """
         observer = core.observer
         rate, self._samples_before = self._samples - self._samples_before, self._samples

@@ -42,34 +42,34 @@ PARAMETERS = (
         "The controller that follows: shaped trajectories go to its topic joint_trajectory, goals to its actions."
     ),
     parameter("synchronised_clocks", True, read_only=True).described(
-        "Whether the controller's clock is this node's; false: stamps are 0, which means now."
+        "Whether the controller has the same clock as this node; false: stamps are 0, which means now."
     ),
     parameter(
         "time_law", trajectory_shaper.GIVEN, choices=trajectory_shaper.TIME_LAWS, read_only=True
     ).described(
-        "Time law of trajectories before they are shaped: that of their points, or the quickest within the limits: "
-        "jerk_limited along a straight line, time_optimal through all points, which then need no times."
+        "Time law of trajectories before they are shaped. given: that of their points; otherwise the quickest within "
+        "the limits, jerk_limited along a straight line, time_optimal through all points, which then need no times."
     ),
     parameter("stream_output", "", read_only=True).described(
-        "Topic to which the shaped stream goes, forward_position_controller/commands, say; empty: no streams."
+        "Topic to which the shaped stream goes, such as forward_position_controller/commands; empty: no streams."
     ),
     parameter("play_trajectories", False, read_only=True).described(
-        "Send shaped trajectories as positions to stream_output, with the damping's correction, in place of to output; "
-        "the topic stream is then not taken."
+        "Send shaped trajectories as positions to stream_output, with the damping's correction, instead of to output; "
+        "the topic stream is then ignored."
     ),
     parameter("stream_kind", POSITIONS, choices=(POSITIONS, VELOCITIES), read_only=True).described(
-        "What the stream has: positions [rad] or velocities [rad/s] of all joints."
+        "Content of the stream: positions [rad] or velocities [rad/s] of all joints."
     ),
     parameter("stream_rate", 125.0, "Hz", 1.0, 2000.0, read_only=True).described(
         "Rate of the shaped stream."
     ),
     parameter("stream_timeout", 0.2, "s", 0.01, 60.0, read_only=True).described(
-        "Without inputs for so long, velocities are 0, and a stream that stands is no longer published."
+        "Without inputs for this long, velocities become 0, and a constant stream is no longer published."
     ),
 )
 #: Prefix of the parameters that may change at run time.
 GROUP = "shaper."
-#: Between two looks at whether a motion has ended; measured positions are used while they are not older [s].
+#: Time between two looks at whether a motion has ended; largest age of measured positions that are used [s].
 LOOK, FRESH = 0.01, 1.0
 
 
@@ -131,7 +131,7 @@ class ShaperNode(ArmNode):
         self.make_timer(LOOK, self._look)
 
     def _make_shapers(self):
-        """Make the shapers of the parameters, with and without bypass; their `Modes`."""
+        """Make the shapers of the parameters, with and without bypass; returns their `Modes`."""
         names, limits = self.joint_names, self.parameters.group("limits.")
         own = Modes(self.parameters.group(GROUP), len(names))
         none = Modes({**self.parameters.group(GROUP), "type": modes.NONE}, len(names))
@@ -181,16 +181,16 @@ class ShaperNode(ArmNode):
             self._trajectories.publish(message)
 
     def shape(self, msg, done, refused):
-        """Shape a trajectory that takes the place of one; without points: a stop, as the controller has it.
+        """Shape a trajectory that replaces the present one; without points it is a stop, as for the controller.
 
-        Where a new time law is to be made, that is done in a thread, and what moves goes on meanwhile.
+        A new time law is computed in a thread, and the present motion goes on meanwhile.
 
         Parameters
         ----------
         msg : JointTrajectory
         done, refused : callable
-            Called with the shaped message once it begins, or with a `TrajectoryError`; nothing changes then, but the
-            state has the reason.
+            Called with the shaped message once it begins, or with a `TrajectoryError`; then nothing changes, except
+            that the state has the reason.
         """
         now = self.now_ns()
         self._settle(now)
@@ -249,7 +249,7 @@ class ShaperNode(ArmNode):
         done(self._message(shaped, stamp_ns))
 
     def _rows(self, msg):
-        """Points of a trajectory; where the node makes the time law, without speeds, and also without times."""
+        """Points of a trajectory; if the node makes the time law, they have no speeds and need no times."""
         given = rows(msg)
         if self.parameters["time_law"] == trajectory_shaper.GIVEN:
             return given
@@ -260,14 +260,14 @@ class ShaperNode(ArmNode):
         ]
 
     def stopping(self, reason, done):
-        """Stop what moves, and what is being worked on; whether there is anything.
+        """Stop the motion under way, and drop one that is being prepared; returns whether there is any.
 
         Parameters
         ----------
         reason : str
-            For the state.
+            Reason for the state.
         done : callable
-            Called with the trajectory that stops the motion under way, where there is one.
+            Called with the trajectory that stops the motion under way, if there is one.
         """
         dropped, now = self.job.drop(f"stopped before it began: {reason}"), self.now_ns()
         if not self.core.moving(now):
@@ -291,7 +291,7 @@ class ShaperNode(ArmNode):
         self.get_logger().warning(f"the motion does not stop: {error}")
 
     def lost(self):
-        """The controller does not follow what was sent: the joints are elsewhere."""
+        """Forget the motion, since the controller does not follow it and the joints are elsewhere."""
         self.job.drop("the motion before it was not followed to its end")
         self.core.forget()
 
@@ -301,7 +301,7 @@ class ShaperNode(ArmNode):
         self._publish_state()
 
     def _message(self, shaped, stamp_ns):
-        """A `Shaped` as a message; one that was to begin now and finds the joints at rest still does."""
+        """A `Shaped` as a message; one that was to begin now, with the joints at rest, still begins now."""
         message = JointTrajectory(joint_names=self.joint_names)
         now = shaped.fresh and stamp_ns == 0
         if not now and self.parameters["synchronised_clocks"]:
@@ -335,7 +335,7 @@ class ShaperNode(ArmNode):
             self._speeds = np.full(found.size, np.nan)
 
     def _where(self):
-        """Where the joints are (n,), None where that is unknown; what is played must not step.
+        """Where the joints are (n,), None if that is unknown; a motion that is played begins there, without a step.
 
         Raises
         ------
@@ -356,7 +356,7 @@ class ShaperNode(ArmNode):
         return self._measured if self._steady_s() - self._measured_at < FRESH else None
 
     def _measured_state(self):
-        """Positions and speeds of the joints (2, n), None where they do not come; nan where speeds do not."""
+        """Positions and speeds of the joints (2, n); None if positions do not come, nan where speeds do not."""
         found = self._measurement()
         return None if found is None else np.stack([found, self._speeds])
 
@@ -376,7 +376,7 @@ class ShaperNode(ArmNode):
         return response
 
     def _settle(self, now_ns):
-        """Take a bypass or new parameters where nothing moves: a change in the middle would be a step."""
+        """Take a bypass or new parameters when nothing moves, since a change during a motion would be a step."""
         stream = self._streams[self._bypass]
         if self._bypass == self._wanted and not self._changed:
             return
@@ -442,7 +442,7 @@ class ShaperNode(ArmNode):
         self.make_timer(self._step, self._on_tick)
 
     def _refuse_without_stream(self, topic, field, kinds):
-        """Refuse what needs a stream of some `kinds` where there is none: its `topic`, the `field` that needs it."""
+        """Refuse a `field` that needs a stream of some `kinds`, if its `topic` or kind is missing."""
         if not topic or self.parameters["stream_kind"] not in kinds:
             named = " or ".join(kinds)
             hint = f"give stream_output, with stream_kind {named}"
@@ -542,7 +542,7 @@ def joint_names(given):
     Raises
     ------
     ParameterError
-        Where none is `given`, or one twice.
+        If none is `given`, or one twice.
     """
     names = [name for name in given if name]
     hint = "give the joints of the controller that follows, in its order"

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Action servers of the shaper: goals are shaped and sent on to the controller's own server, results sent back.
+"""Action servers of the shaper: they shape goals, send them on to the controller's own server, and return the results.
 
-A goal that is cancelled ends in a stop that is shaped: the stop goes to the controller as a goal that replaces the one
-that it follows, and the result is sent once that is done. Where the node plays trajectories itself, there is no
-controller to ask: a goal has succeeded once its motion has ended and the joints are within the goal's tolerances.
+A cancelled goal ends in a shaped stop. The stop goes to the controller as a goal that replaces the one that it follows,
+and the result is sent once that is done. If the node plays trajectories itself, there is no controller to ask: a goal
+has succeeded once its motion has ended and the joints are within the goal's tolerances.
 """
 
 from types import MappingProxyType
@@ -18,7 +18,7 @@ from flexarm_ros.messages import set_stamp
 from ..trajectory.goal import Code, GoalCheck, tolerances
 from .goals import Server, kinds, refuse_what_is_not_served
 
-#: Of a played goal nothing is judged but what it asks for itself.
+#: A played goal is judged only by the tolerances that it gives itself.
 NOT_JUDGED = MappingProxyType({
     "constraints.trajectory": 0.0,
     "constraints.goal": 0.0,
@@ -29,14 +29,14 @@ NOT_JUDGED = MappingProxyType({
 
 
 class Goal:
-    """A goal on its way.
+    """A goal under way.
 
     Parameters
     ----------
     server : Server
     handle : ServerGoalHandle
     client : ActionClient
-        Of the controller's server of the same type.
+        Client of the controller's server of the same type.
     """
 
     def __init__(self, server, handle, client):
@@ -44,7 +44,7 @@ class Goal:
         self.sent = 0  # goals sent on; results of all but the last don't count
         self.over = False
         self.reason = ""
-        self.tolerances = self.check = None  # where the node plays it
+        self.tolerances = self.check = None  # if the node plays it
 
 
 class ShaperGoals:
@@ -73,12 +73,12 @@ class ShaperGoals:
         return any(client.server_is_ready() for client in self._clients.values())
 
     def close(self):
-        """The node stops: what is under way is no longer followed."""
+        """End the goal under way, since the node stops."""
         if self._current is not None:
             self._end(self._current, Code.INVALID_GOAL, "the shaper was stopped")
 
     def may_begin(self, request):
-        """Accept any goal while active: what is wrong with it, its result says in words."""
+        """Accept any goal while active; its result states what is wrong with it."""
         return GoalResponse.ACCEPT if self._node.active else GoalResponse.REJECT
 
     def take(self, server, handle):
@@ -105,7 +105,7 @@ class ShaperGoals:
             self._preparing = goal
 
     def _tolerances(self, request):
-        """What a goal that is played asks for."""
+        """Tolerances that a played goal asks for."""
         refuse_what_is_not_served(request)
         if getattr(request, "tip_tolerance", 0.0) > 0.0:
             hint = "leave it 0: the shaper has no arm file"
@@ -120,14 +120,14 @@ class ShaperGoals:
         return tolerances(self._node.joint_names, 0.0, NOT_JUDGED, *rows, time, -1.0)
 
     def _refuse(self, goal, error):
-        """The trajectory of a goal can't be shaped."""
+        """End a goal whose trajectory can't be shaped."""
         if self._preparing is goal:
             self._preparing = None
         code = Code.INVALID_JOINTS if "name" in error.field else Code.INVALID_GOAL
         self._end(goal, code, str(error))
 
     def _begin(self, goal, shaped):
-        """The trajectory of a goal is shaped: it takes the place of the one before."""
+        """Begin a goal whose trajectory is shaped; it replaces the one before."""
         if self._preparing is goal:
             self._preparing = None
         before, self._current = self._current, goal
@@ -142,7 +142,7 @@ class ShaperGoals:
             self._send(goal, goal.handle.request)
 
     def _announce(self, goal, last):
-        """The first feedback: its stamp is the start of the shaped motion, `desired` the end, with the time to it."""
+        """Publish the first feedback: its stamp is the shaped motion's start, `desired` the end with the time to it."""
         feedback = goal.server.action_type.Feedback(joint_names=self._node.joint_names)
         set_stamp(feedback.header.stamp, self._node.started_ns)
         feedback.desired = last
@@ -152,7 +152,7 @@ class ShaperGoals:
         """Stop smoothly for a goal that is under way; it is cancelled once that is done."""
         goal = self._preparing
         if goal is not None and goal.handle == handle:
-            # Its state changes once this is accepted, and then it can end; what moves before it goes on.
+            # Its state changes once this is accepted, and then it can end; the motion before it goes on.
             self._preparing = None
             self._node.job.forget()
             error = TrajectoryError("cancelled before it began", field="trajectory")
@@ -166,7 +166,7 @@ class ShaperGoals:
         return CancelResponse.ACCEPT
 
     def replace(self, message):
-        """Send a trajectory in place of that of the goal under way; whether there is one."""
+        """Send a trajectory in place of that of the goal under way; returns whether there is one."""
         if self._current is None:
             return False
         if self._node.plays:
@@ -177,19 +177,19 @@ class ShaperGoals:
         return True
 
     def replaced(self):
-        """A trajectory has taken over from a goal that was played."""
+        """End a played goal, since a trajectory has taken over from it."""
         if self._node.plays and self._current is not None:
             self._end(self._current, Code.INVALID_GOAL, "replaced by a trajectory")
 
     def look(self, now_ns, state, measured):
-        """The motion has ended: so has a goal that was played, once the joints are where it wants them.
+        """End a played goal after its motion has ended, once the joints are where it wants them.
 
         Parameters
         ----------
         now_ns : int
             [ns]
         state : (3, n) ndarray
-            Of the motion [rad], [rad/s], [rad/s^2].
+            State of the motion [rad], [rad/s], [rad/s^2].
         measured : (2, n) ndarray or None
             Positions and speeds of the joints [rad], [rad/s]; nan where unknown.
         """
@@ -215,7 +215,7 @@ class ShaperGoals:
         self._finish(goal, GoalStatus.STATUS_SUCCEEDED, goal.server.action_type.Result())
 
     def tell(self, state, measured):
-        """Feedback of a goal that is played, and whether it is within its tolerances; as of `look`."""
+        """Publish the feedback of a played goal, and abort it beyond its tolerances; arguments as for `look`."""
         goal = self._current
         if goal is None:
             return
@@ -235,7 +235,7 @@ class ShaperGoals:
             self._abort(goal, outcome.text)
 
     def _blind(self, goal, measured):
-        """End a goal with tolerances where the joints' positions do not come; whether that is so."""
+        """End a goal with tolerances if the joints' positions do not come; returns whether that is so."""
         limits = goal.tolerances
         judged = np.isfinite(limits.path).any() or np.isfinite(limits.goal).any()
         if measured is not None or not judged:
@@ -244,7 +244,7 @@ class ShaperGoals:
         return True
 
     def _abort(self, goal, text):
-        """End a goal that is played, and stop."""
+        """End a played goal, and stop."""
         self._end(goal, Code.PATH_TOLERANCE_VIOLATED, text)
         self._node.stopping(text, lambda _: None)
 
@@ -280,7 +280,7 @@ class ShaperGoals:
         future.add_done_callback(answered)
 
     def _relay(self, goal, answer):
-        """The controller's result is that of the goal."""
+        """Send the controller's result as that of the goal."""
         result = answer.result
         if answer.status != GoalStatus.STATUS_SUCCEEDED:
             self._node.lost()
@@ -289,7 +289,7 @@ class ShaperGoals:
         self._finish(goal, answer.status, result)
 
     def _end(self, goal, code, text):
-        """A result of the shaper's own."""
+        """Send the shaper's own result."""
         result = goal.server.action_type.Result()
         result.error_code, result.error_string = int(code), text
         self._node.get_logger().warning(f"goal: {text}")

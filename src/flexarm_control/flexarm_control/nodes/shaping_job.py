@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trajectory that the shaper node is working on, off its own thread: a new time law can take seconds."""
+"""Shapes a trajectory outside of the shaper node's own thread, since a new time law can take seconds."""
 
 from concurrent.futures import ThreadPoolExecutor
 
 from flexarm_dynamics.errors import TrajectoryError
 
-#: Trajectories that are worked on at once: one that was replaced is not waited for.
+#: Number of trajectories that are worked on at once, since one that was replaced is not waited for.
 THREADS = 2
-#: A motion that is under way is left so much later than asked for: what takes its place has this time to be made [ns].
+#: A motion under way is replaced this much later than requested, so that there is time to compute the next one [ns].
 AHEAD = 100_000_000
 
 
@@ -17,11 +17,11 @@ class Job:
     Parameters
     ----------
     prepare, quick : callable
-        Give its plan: of any thread, when it may take long; in the node's own, at its `due` time at the latest.
+        Give its plan: `prepare` in any thread, where it may take long; `quick` in the node's own, at its due time.
     due_ns : int or None
-        When it takes the place of the motion under way [ns]; None: there is none, it begins once it is ready.
+        When it replaces the motion under way [ns]; None: there is none, and it begins once it is ready.
     done, refused : callable
-        What the node's own thread then calls, with the plan or a `TrajectoryError`.
+        Called in the node's own thread, with the plan or a `TrajectoryError`.
     """
 
     def __init__(self, prepare, quick, due_ns, done, refused):
@@ -30,11 +30,11 @@ class Job:
         self.result, self.ready = None, False
 
     def put(self, result):
-        """The plan, None where there is nothing to do, or a `TrajectoryError`."""
+        """Set the `result`: the plan, None if there is nothing to do, or a `TrajectoryError`."""
         self.result, self.ready = result, True
 
     def finished(self, now_ns):
-        """Whether its result can be used at a time [ns]; at its due time the quick one is made where there is none."""
+        """Whether its result can be used at a time [ns]; at its due time the quick one is made if there is none."""
         if isinstance(self.result, TrajectoryError) or self.due_ns is None:
             return self.ready
         if now_ns < self.due_ns:
@@ -50,12 +50,12 @@ class Job:
 
 
 class ShapingJob:
-    """At most one `Job`: a newer one takes its place.
+    """Holds at most one `Job`; a newer one replaces it.
 
     Parameters
     ----------
     node : ArmNode
-        With `now_ns`.
+        Node with `now_ns`.
     """
 
     def __init__(self, node):
@@ -64,7 +64,7 @@ class ShapingJob:
 
     @property
     def busy(self):
-        """Whether there is one."""
+        """Whether there is a job."""
         return self._job is not None
 
     def begin(self, job):
@@ -74,18 +74,18 @@ class ShapingJob:
         self._thread.submit(self._work, job)
 
     def drop(self, reason):
-        """Work on it no more; whether there was one, which is refused with the `reason`."""
+        """Give the job up, and refuse it with the `reason`; returns whether there was one."""
         job, self._job = self._job, None
         if job is not None:
             job.refused(TrajectoryError(reason, field="trajectory"))
         return job is not None
 
     def forget(self):
-        """Work on it no more, and call nothing back."""
+        """Give the job up, and call nothing back."""
         self._job = None
 
     def look(self, now_ns):
-        """Hand out the result, if it is time [ns]."""
+        """Hand out the result, if it can be used at a time [ns]."""
         job = self._job
         if job is None or not job.finished(now_ns):
             return
@@ -93,12 +93,12 @@ class ShapingJob:
         job.answer()
 
     def close(self):
-        """The node ends; what is under way is not waited for."""
+        """End with the node; work under way is not waited for."""
         self._job = None
         self._thread.shutdown(wait=False, cancel_futures=True)
 
     def _work(self, job):
-        """In a thread."""
+        """Prepare a job, in a thread."""
         if job is self._job:
             self._node.hand_over(self._ready, job, attempt(job.prepare))
 
@@ -109,7 +109,7 @@ class ShapingJob:
 
 
 def attempt(make):
-    """What ``make()`` gives, or the `TrajectoryError` that it raises; any other error of it as one."""
+    """The result of ``make()``, or the `TrajectoryError` that it raises; any other error is turned into one."""
     try:
         return make()
     except TrajectoryError as error:

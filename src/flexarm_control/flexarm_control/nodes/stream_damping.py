@@ -17,17 +17,17 @@ PARAMETERS = (
         "Joint whose streamed values are corrected to damp a mode that a sensor shows; empty: no damping."
     ),
     parameter("sensor", "strain", choices=("strain", "imu"), read_only=True).described(
-        "What shows the mode: a reading in the topic strain, or an acceleration in the topic imu [m/s^2]."
+        "Sensor that shows the mode: a reading in the topic strain, or an acceleration in the topic imu [m/s^2]."
     ),
     parameter("axis", "y", choices=("x", "y", "z"), read_only=True).described(
-        "Of the IMU: the axis along which the mode moves it."
+        "Axis of the IMU along which the mode moves it."
     ),
     parameter("gauge", 0, "-", 0, 1000, read_only=True).described(
-        "Which of the readings in strain sees the mode, counted from 0."
+        "Index of the reading in strain that shows the mode, counted from 0."
     ),
     *strain_damping.PARAMETERS,
 )
-#: Less than this is no full scale of an accelerometer [m/s^2].
+#: Minimum full scale of an accelerometer [m/s^2].
 MIN_SCALE = 1.0
 
 
@@ -42,7 +42,7 @@ class StreamDamping:
     settings : mapping
         Checked values of `PARAMETERS`.
     period : float
-        Of the stream [s].
+        Period of the stream [s].
     velocities : bool
         Whether the stream has velocities.
 
@@ -53,7 +53,7 @@ class StreamDamping:
     Raises
     ------
     ParameterError
-        Where the joint is not one of the stream's.
+        If the joint is not one of the stream's.
     DesignError
         As `StrainDamping`.
     """
@@ -87,7 +87,7 @@ class StreamDamping:
 
     def _on_imu(self, msg):
         self._reading = getattr(msg.linear_acceleration, self._axis)
-        # A clock of its own says nothing about now, and 0 is no stamp.
+        # A stamp of another clock says nothing about now, and 0 is no stamp.
         stamp = stamp_ns(msg.header.stamp)
         own = self._node.parameters["synchronised_clocks"] and stamp
         self._stamp = 1e-9 * stamp if own else None
@@ -99,7 +99,7 @@ class StreamDamping:
         self._reading = msg.data[self._gauge]
 
     def corrected(self, values, now):
-        """Positions [rad] or velocities [rad/s] (n,) with the correction of a time `now` [s]; once in each period."""
+        """Positions [rad] or velocities [rad/s] (n,) with the correction at a time `now` [s]; call once a period."""
         reading, self._reading = self._reading, None
         out, correction = values.copy(), self.law.update(now, reading, self._stamp)
         out[self._joint] += self.law.rate if self._velocities else correction

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories on their way from a raw message to the controller: read, prepared, and offered or refused."""
+"""Takes trajectories from a raw message to the controller: reads and prepares them, and offers or refuses them."""
 
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from functools import partial
@@ -13,11 +13,11 @@ from flexarm_ros.messages import stamp_ns, trajectory_name, trajectory_points
 
 from .. import trajectory
 
-#: Longer trajectories are refused: their points are read in one go.
+#: Longer trajectories are refused, since their points are read in one go.
 MAX_POINTS = 10_000
 #: Trajectories that come within this time of each other, by the arm's clock, are a stream [ns].
 STREAMED = 500_000_000
-#: A motion is offered at least so long before its own start [ns].
+#: A motion is offered at least this long before its own start [ns].
 IN_TIME = 30_000_000
 
 
@@ -30,9 +30,9 @@ def rows(msg):
 
 
 def read(raw, arm, held=None, streaming=trajectory.streams.PLAIN):
-    """A serialised `JointTrajectory`, `raw`, as `JointTrajectoryData`; a `TrajectoryError` where that can't be.
+    """Read a serialised `JointTrajectory`, `raw`, as `JointTrajectoryData`; raises a `TrajectoryError` if it can't.
 
-    `held` and `streaming` as of `validate`.
+    `held` and `streaming` are as for `validate`.
     """
     try:
         count = trajectory_points(raw)
@@ -83,7 +83,7 @@ class TrajectoryInbox:
             self._thread.submit(self._designer.warm_up)
 
     def receive(self, raw):
-        """Take a serialised message: turning thousands of points into objects would hold up the control path."""
+        """Take a serialised message, since turning thousands of points into objects would delay the control path."""
         if self._node.active:
             self._thread.submit(self._read_and_prepare, raw, self._core.law.feedforward)
 
@@ -120,7 +120,7 @@ class TrajectoryInbox:
         self._node.hand_over(self._offer, data, plan, name)
 
     def _in_time(self, data):
-        """Whether a plan is still of use: one with stamp 0 waits for it, another one begins without."""
+        """Whether a plan is still of use: a trajectory with stamp 0 waits for it, another one begins without."""
         now = self._core.reference.stamp_ns
         return now is None or not data.stamp_ns or now < data.stamp_ns - IN_TIME
 
@@ -144,7 +144,7 @@ class TrajectoryInbox:
             self._log(f"trajectory refused: {verdict.reason}")
 
     def _log(self, text, info=False):
-        """Log what became of a trajectory; of a stream, whose lines differ in their numbers, one in ten seconds."""
+        """Log the result of a trajectory; of a stream, whose lines differ in their numbers, one in ten seconds."""
         last, now = self._last_came, self._core.reference.stamp_ns
         log, self._last_came = self._node.get_logger(), now
         if last is not None and now is not None and now - last < STREAMED:
@@ -155,5 +155,5 @@ class TrajectoryInbox:
             log.warning(text)
 
     def close(self):
-        """Take no more messages; what is under way is not waited for."""
+        """Take no more messages; work under way is not waited for."""
         self._thread.shutdown(wait=False, cancel_futures=True)

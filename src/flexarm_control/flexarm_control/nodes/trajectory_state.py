@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a joint_trajectory_controller shows beside its action: its state, where the reference is, and speed scaling.
+"""Topics and services of a joint_trajectory_controller beside its action: state, reference, and speed scaling.
 
-In types of our own everywhere; in those of control_msgs, under the names that such a controller has, where that package
-is installed.
+They always exist in our own types. If control_msgs is installed, they also exist in its types, under the names that
+such a controller has.
 """
 
 import importlib
@@ -19,7 +19,7 @@ from flexarm_ros.messages import set_stamp, stamp_ns
 
 STATE_PUBLISH_RATE = parameter(
     "state_publish_rate", 50.0, "Hz", 0.1, 1000.0, read_only=True
-).described("Rate of trajectory_state and controller_state (wall time), while someone listens.")
+).described("Rate of trajectory_state and controller_state (wall time), while subscribed.")
 
 
 def states():
@@ -37,7 +37,7 @@ def queries():
 
 
 def _theirs(module, name):
-    """A type of control_msgs; None where it is not installed."""
+    """A type of control_msgs; None if it is not installed."""
     try:
         return getattr(importlib.import_module(f"control_msgs.{module}"), name, None)
     except ImportError:
@@ -105,7 +105,7 @@ class TrajectoryState:
         return message
 
     def _answer(self, request, response):
-        """Where the reference is at a time."""
+        """Answer where the reference is at a time."""
         core, stamp = self._core, stamp_ns(request.time)
         last = core.reference.stamp_ns
         state = None if last is None else core.reference.look_at(stamp)
@@ -120,7 +120,7 @@ class TrajectoryState:
         return response
 
     def _scale(self, message):
-        """A factor on the topic: the parameter, as if it were set."""
+        """Take a factor from the topic, as if the parameter were set."""
         given = Parameter("speed_scaling", value=float(message.factor))
         result = self._node.set_parameters([given])[0]
         if not result.successful:

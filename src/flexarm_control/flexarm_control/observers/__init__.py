@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observers: what reconstructs the rates of the deflections. One observer per file."""
+"""Observers, which reconstruct the rates of the deflections; one observer per file."""

@@ -23,10 +23,10 @@ PARAMETERS = (
         "Corner of the filtered derivative of the joint positions, for a source without joint velocities."
     ),
     parameter("measured_velocity", True).described(
-        "Use the joint velocities that the source sends; false: as of a source without. They are checked all the same."
+        "Use the joint velocities that the source sends; false: as if it sent none. They are checked in both cases."
     ),
     parameter("delay", 0.0, "s", 0.0, 0.1).described(
-        "Time from a sample's stamp until its torque acts; the estimate is predicted ahead by it."
+        "Time from a sample's stamp until its torque acts; the estimate is predicted ahead by this time."
     ),
     parameter("smooth_position", True).described(
         "Use the observer's joint positions, if it estimates them, instead of the encoders'."
@@ -37,12 +37,12 @@ PARAMETERS = (
 
 
 def design_observer(name, model, values):
-    """As `component.make`, of an observer by its `name`."""
+    """As `component.make`, for an observer by its `name`."""
     return make(OBSERVERS, name, model, values, "observer.")
 
 
 def observe(model, name, values):
-    """The `ArmObserver` of an observer's `name` and its parameters, those of `PARAMETERS` among them.
+    """The `ArmObserver` for an observer's `name` and parameters, which include those of `PARAMETERS`.
 
     Raises
     ------
@@ -57,11 +57,11 @@ def observe(model, name, values):
 class ArmObserver:
     r"""Estimates modal amplitudes and rates, sample by sample.
 
-    A joint velocity that the source does not report, or that is not to be used, is the observer's estimate, if it makes
-    one, else the filtered derivative of the positions.
+    If the source does not report joint velocities, or these are not to be used, the observer's estimate takes their
+    place or, if it makes none, the filtered derivative of the positions.
 
-    With a `delay`, the estimate is the state at the stamp plus the delay: the model's motion (`motion`) under the
-    reported torque, held. Torques sent since then are unknown here.
+    With a `delay`, the estimate is the state at the stamp plus the delay, after the model's motion (`motion`) under the
+    constant reported torque. Torques sent since then are unknown here.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ class ArmObserver:
     calibration : BiasCalibration or None
         The last samples, for `calibrate`.
     monitor : Monitor
-        Judges whether the readings can be true together, where the settings ask for it.
+        Judges whether the readings can be true together, if the settings ask for it.
     calibrated : bool
         Whether the strains are mapped with a bias from `calibrate`. Amplitudes from the source are then ignored,
-        since they are made with the arm file's bias.
+        since they are computed with the arm file's bias.
     position, velocity : ndarray, shape (n,)
-        Of the joints, measured or estimated, predicted ahead by the delay [rad], [rad/s].
+        Joint positions and velocities, measured or estimated, predicted ahead by the delay [rad], [rad/s].
     amplitude, rate : ndarray, shape (m,)
         The observer's estimate, predicted ahead by the delay.
     """
@@ -130,16 +130,16 @@ class ArmObserver:
         ----------
         sample : ArmSample
             Its `amplitude` is filled in from the strains if it is None. Readings that can't be true are replaced, and
-            `trust` and `doubt` are set: see `plausibility.monitor`. What only shows over several samples is in the next
-            one's.
+            `trust` and `doubt` are set: see `plausibility.monitor`. Errors that only show over several samples are
+            reported with the next one.
         later : bool
-            Leave that to `look_ahead`, which must then be called before the next sample, with this one unchanged.
+            Leave those to `look_ahead`, which must then be called before the next sample, with this one unchanged.
 
         Returns
         -------
         bool or None
             Whether `velocity`, `amplitude` and `rate` are a converged estimate. A repeated (session, sequence)
-            changes nothing; nor does a sample that is older than the last one, for which it is None.
+            changes nothing; nor does a sample that is older than the last one, for which the result is None.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class ArmObserver:
         return self.observer.converged
 
     def look_ahead(self):
-        """Do what `step` left, and beforehand what the next sample will need; call once the estimate is sent."""
+        """Do what `step` left, and compute ahead for the next sample; call once the estimate is sent."""
         self._take()
         self.observer.look_ahead()
 
@@ -212,16 +212,16 @@ class ArmObserver:
         return self.settings["plausibility"]
 
     def _judge(self, sample, dt):
-        """Have the readings of a new sample judged; whether the observer is to start afresh."""
+        """Have the readings of a new sample judged; returns whether the observer has to start again."""
         order = self._order
         if self.monitor.stamp_ns != order.stamp_ns:  # it was off until now
             dt = 0.0
         return self.monitor.judge(sample, dt, (sample.sequence - order.sequence) % WRAP)
 
     def _step_of(self, sample):
-        """Time since the last sample [s]: that of the stamps, or of the numbers where the source's clock has jumped.
+        """Time since the last sample [s], by the stamps, or by the numbers if the source's clock has jumped.
 
-        Over a jump the old estimate goes on; over a pause of the source nothing is known of the torque.
+        Over a jump the old estimate goes on. During a pause of the source the torque is unknown.
         """
         order = self._order
         dt = 1e-9 * (sample.stamp_ns - order.stamp_ns)
@@ -234,7 +234,8 @@ class ArmObserver:
     def warm_up(self):
         """Take samples so that all compiled code is loaded; discard the observer afterwards.
 
-        First three of an arm at rest, then of one that swings a little, until the strains are compared with the motion.
+        The first three are of an arm at rest, the others of one that swings a little, until the strains are compared
+        with the motion.
         """
         arm = self.model.arm
         sample = ArmSample(len(arm.joints), self.model.n_modes, len(arm.gauges))
@@ -267,7 +268,7 @@ class ArmObserver:
                 )
 
     def calibrate(self):
-        """Set the gauges' bias from the last samples, of an arm at rest; not on the control path.
+        """Set the gauges' bias from the last samples, which are of an arm at rest; not on the control path.
 
         The estimate moves with the bias, so that its rates don't jump.
 
@@ -279,7 +280,7 @@ class ArmObserver:
         Raises
         ------
         MessageError, ModelError
-            If there is nothing to calibrate or the arm is not at rest; nothing changes then.
+            If there is nothing to calibrate, or the arm is not at rest; then nothing changes.
         """
         if self.calibration is None:
             raise MessageError(f"the arm file of {self.model.arm.name} has none", field="gauges")
@@ -291,7 +292,7 @@ class ArmObserver:
         return old, new
 
     def _estimate(self, sample, dt, measured):
-        """Update the observer, and set the output; `measured`: the sample's joint velocities are."""
+        """Update the observer and set the output; `measured`: whether the joint velocities are measured."""
         self._update(sample, dt)
         self._pass_on(sample, measured)
 
@@ -309,7 +310,7 @@ class ArmObserver:
             n, p = position.size, x.size // 2
             position, amplitude, velocity, rate = np.split(x, (n, p, p + n))
         if not self._kernels.join(position, amplitude, velocity, rate, self._state):
-            # It would stay so for ever.
+            # Without a reset the estimate would never be finite again.
             observer.reset()
             name = type(observer).__name__
             problem = "has lost the arm: its estimate is not finite"
@@ -327,12 +328,12 @@ class ArmObserver:
         try:
             self.observer.update(sample, dt)
         except MessageError as error:
-            # What it lacks may have been taken out.
+            # The monitor may have taken out what the observer lacks.
             doubt = self.monitor.doubts.text if self._judges else ""
             if doubt:
                 raise MessageError(f"{doubt}; {error}") from error
             raise
-        except Exception as error:  # of third-party code: it costs this sample, not the node
+        except Exception as error:  # an error of third-party code costs this sample, not the node
             raise MessageError(
                 f"failed: {type(error).__name__}: {error}",
                 field=f"observer {type(self.observer).__name__}",
@@ -364,11 +365,11 @@ class ArmObserver:
         return difference + (self._derivative - difference) * np.exp(-bandwidth * dt)
 
 
-#: Samples of a warm-up, and the time between them [ns]: together longer than a filter of the strains settles.
+#: Samples of a warm-up, and the time between them [ns]; together they take longer than a strain filter to settle.
 WARM_UP, WARM_UP_NS = 250, 4_000_000
-#: A step by the stamps this many times as long as by the numbers may be a jump of the clock [-].
+#: A step by the stamps that is this many times as long as by the numbers may be a jump of the clock [-].
 JUMP_PERIODS = 20.0
-#: After a longer silence an observer starts afresh [ns].
+#: After a longer silence an observer starts again [ns].
 MAX_GAP_NS = 500_000_000
 #: A longer delay is predicted in parts, each with the forces at its start [s].
 MAX_PREDICTION = 0.01

@@ -14,8 +14,8 @@ from ..component import Component
 class Observer(Component, ABC):
     """Reconstructs modal rates (and may smooth amplitudes) from samples of modal amplitudes.
 
-    Registered by name in the entry-point group ``flexarm.observers``. Design work is done in the
-    constructor; `update` runs on the control path.
+    An observer is registered by name in the entry-point group ``flexarm.observers``. The constructor does all design
+    work; `update` runs on the control path.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ class Observer(Component, ABC):
     joint_position, joint_velocity : ndarray, shape (n,), or None
         The estimate of the joints [rad], [rad/s], if the observer makes one.
     innovation_squared : float
-        Normalised innovation squared of the last sample [-], whose mean is the number of measurements if the
-        noise is as assumed; NaN where the observer has none.
+        Normalised innovation squared of the last sample [-]. Its mean is the number of measurements if the noise is as
+        assumed. NaN if the observer has none.
     consistent : bool
         False while the innovations are larger than the assumed noise explains.
     gauges_lost : tuple of int
-        Gauges that the amplitudes are made without, see `leave_out`; indices, ascending.
+        Gauges that are left out of the amplitudes, see `leave_out`; indices, ascending.
     parameters_estimated : dict of str to float
-        Estimated parameters of the arm itself; the name has the unit.
+        Estimated parameters of the arm itself; each name contains the unit.
     """
 
     joint_position = joint_velocity = None
@@ -67,12 +67,12 @@ class Observer(Component, ABC):
         self.converged, self._elapsed = False, -1.0
 
     def resume(self, other):
-        """Continue from another observer's estimate, so that a redesign does not start afresh."""
+        """Continue from another observer's estimate, so that a redesign does not start over."""
         self.amplitude[:], self.rate[:] = other.amplitude, other.rate
         self.converged, self._elapsed = other.converged, other._elapsed
 
     def leave_out(self, lost):
-        """Expect noisier amplitudes from the next sample on: they are made without these gauges."""
+        """Expect noisier amplitudes from the next sample on, computed without the gauges in `lost`."""
         self.gauges_lost = lost
 
     def rest_at(self, amplitude):
@@ -96,7 +96,7 @@ class Observer(Component, ABC):
 
 
 def need_torque(torque, what, hint):
-    """Refuse a sample without torque, (n,): `what` predicts with it."""
+    """Refuse a sample without torque, (n,), because `what` predicts with it."""
     if not finite(torque):
         raise MessageError(
             f"is unknown (NaN), and {what} predicts with it",

@@ -7,8 +7,8 @@ The state of `kalman` is augmented by parameters, each a slow random walk:
     \dot x = f(x, u, \theta), \qquad \dot\theta = w, \qquad
     \theta = (s,\ b_1 \ldots b_n,\ c_1 \ldots c_n)
 
-with s the scale of the payload's mass and inertia, and the friction torque
-:math:`b_i\dot q_i + c_i\tanh(\dot q_i/\epsilon_i)` of each joint instead of the arm file's. Mass matrix and forces
+where s is the scale of the payload's mass and inertia. Each joint has the friction torque
+:math:`b_i\dot q_i + c_i\tanh(\dot q_i/\epsilon_i)` instead of the arm file's. Mass matrix and forces
 are affine in s. Therefore, with :math:`M_1, a_1` of the arm file's arm and :math:`M_2, a_2` of the arm with twice
 the payload (same mode shapes), the acceleration is exactly
 
@@ -19,7 +19,7 @@ The prediction is the exponential Euler step of `motion` on f, with the Jacobian
 Measurement and update are those of `kalman`. Estimates stay within bounds: no negative mass or friction.
 
 A parameter is found only if the motion excites it: at rest neither friction nor payload is observable. A
-linearisation takes milliseconds, so use it on records, or for arms sampled slowly; see docs/observers.md.
+linearisation takes milliseconds, so use this observer on records or for slowly sampled arms; see docs/observers.md.
 """
 
 import numpy as np
@@ -76,7 +76,7 @@ class ExtendedKalman(Kalman):
     def _prepare(self):
         model, values = self.model, self.parameters
         self._friction = model.friction_table().copy()
-        # Name, first value, deviation, drift and largest value of each; and where those of a kind are.
+        # Name, first value, deviation, drift and largest value of each parameter; and where each kind is.
         rows, self._at = [], {}
 
         def add(kind, names, first, largest):
@@ -139,7 +139,7 @@ class ExtendedKalman(Kalman):
         viscous = theta[self._at["viscous"]] if "viscous" in self._at else viscous
         coulomb = theta[self._at["coulomb"]] if "coulomb" in self._at else coulomb
         friction = viscous * speed + coulomb * np.tanh(speed / smoothing)
-        net = torque + model.friction(speed) - friction  # the model takes its own off again
+        net = torque + model.friction(speed) - friction  # the model subtracts its own
         out = np.zeros(x.size)
         out[:N] = model.derivative(x[:N], net)
         if self._heavier is not None:
@@ -159,10 +159,10 @@ class ExtendedKalman(Kalman):
         return self.state + design.Gamma @ self.derivative(self.state, torque), design
 
     def _foresee(self):
-        """Nothing: the parameters move with the state."""
+        """Do nothing, since the parameters move with the state."""
 
     def _linearised(self, torque, dt):
-        """The step at the estimate under this torque."""
+        """The step, linearised at the estimate under this torque."""
         N, x = 2 * self._p, self.state
         density = np.zeros((x.size, x.size))
         density[:N, :N] = force_density(self.model, x[:N], self.density)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The paper's reconstructing filter: a derivative behind a first-order low-pass.
+r"""The paper's reconstructing filter: a derivative with a first-order low-pass filter.
 
 .. math:: \hat{\dot\delta}(s) = \frac{\omega_c s}{s + \omega_c}\,\delta(s)
 
-discretised exactly for a deflection that moves linearly between samples, with the sample's own time step h:
+It is discretised exactly for a deflection that moves linearly between samples, with the sample's own time step h:
 
 .. math::
     \hat{\dot\delta}_k = s_k + (\hat{\dot\delta}_{k-1} - s_k)\,e^{-\omega_c h},
@@ -28,7 +28,7 @@ class FilteredDerivative(Observer):
         ),
     )
 
-    #: Time constants after which the start is forgotten.
+    #: Number of time constants after which the start is forgotten.
     SETTLING = 5.0
 
     def __init__(self, model, parameters):

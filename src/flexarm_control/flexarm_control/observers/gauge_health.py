@@ -5,13 +5,13 @@ A reading :math:`\varepsilon_i` of gauge i is
 
 - missing when it is not finite,
 - saturated when it is at an end of the bridge's range,
-- stuck when it has been the same to the last bit for `stuck_samples` samples, in which the others of its link and
+- stuck when it has been the same to the last bit for `stuck_samples` samples, while the others of its link and
   direction (two of them, if there are two) moved so far that it must have moved too: by more than 8 of its
-  resolutions, even in the mode that strains it least relative to them,
+  resolutions, even in the mode that strains it least relative to the others,
 - suspect when it does not fit the others: with more gauges than modes, the residual
   :math:`r = \varepsilon - b - R\hat\delta` of weighted least squares has the variance
   :math:`\sigma_i^2(1-H_{ii})`, with :math:`H = R(R^TWR)^{-1}R^TW`; the mean square of
-  :math:`r_i/(\sigma_i\sqrt{1-H_{ii}})` is one for a good gauge, and the wrong gauge has the largest.
+  :math:`r_i/(\sigma_i\sqrt{1-H_{ii}})` is one for a good gauge, and largest for the wrong gauge.
 
 Missing, saturated and stuck gauges are left out of the strain map if the others still give every observed mode.
 Otherwise the sample is refused, since fewer gauges than modes give no amplitudes. A suspect gauge is reported but
@@ -21,7 +21,7 @@ The bias of a gauge on an arm at rest is what it reads beyond the strain of the 
 
 .. math:: b = \bar\varepsilon - R\,\delta_s(q) ,
 
-with the static deflection :math:`\delta_s`, joints held; its rms error is that of one reading over
+where :math:`\delta_s` is the static deflection with held joints. Its rms error is that of one reading divided by
 :math:`\sqrt N`.
 """
 
@@ -33,7 +33,7 @@ from flexarm_dynamics.parameters import parameter
 from .. import kernels
 from ..arrays import some
 
-#: As in flexarm_msgs/ObserverState.
+#: Values as in flexarm_msgs/ObserverState.
 GOOD, MISSING, STUCK, SATURATED, SUSPECT = range(5)
 WORDS = ("good", "missing", "stuck", "saturated", "suspect")
 
@@ -49,14 +49,14 @@ PARAMETERS = (
 
 
 def resolution(gauges):
-    """Noise and rounding of each gauge, (gauges,) [strain]; without either in the arm file, 1/1000 of full scale."""
+    """Noise and rounding of each gauge, (gauges,) [strain]; if the arm file has neither, 1/1000 of full scale."""
     return np.array([g.uncertainty or 1e-3 * g.full_scale for g in gauges])
 
 
 def min_travel(rows, gauges):
     """Least strain of gauge i per strain of gauge j, over the modes that strain both, shape (gauges, gauges).
 
-    Zero for gauges of different links or directions, and on the diagonal; `rows` are the strain map's.
+    It is zero for gauges of different links or directions, and on the diagonal. `rows` are the strain map's.
     """
     count = len(gauges)
     least = np.zeros((count, count))
@@ -77,7 +77,7 @@ class GaugeHealth:
     ----------
     model : ArmModel
     strain_map : StrainMap
-        Of the same model.
+        Strain map of the same model.
     stuck_samples : int
         See `PARAMETERS`.
 
@@ -88,7 +88,7 @@ class GaugeHealth:
     lost : tuple of int
         Gauges left out of the last amplitudes; indices, ascending.
     doubted : ndarray of bool, shape (gauges,)
-        Gauges that other checks have found wrong: suspect, and left out where the others suffice.
+        Gauges that other checks have found wrong. They are suspect, and left out if the others suffice.
     """
 
     #: A gauge is stuck if it should have moved by this many resolutions; noise spans about as many.
@@ -104,12 +104,12 @@ class GaugeHealth:
         self._resolution = resolution(gauges)
         self._min_travel = min_travel(strain_map.rows, gauges)
         places = [(g.link, g.direction) for g in gauges]
-        # A single gauge that jumps may be broken itself; two have seen the arm move.
+        # A single gauge that jumps may itself be broken; two that jump have seen the arm move.
         self._witnesses = np.clip((self._min_travel > 0.0).sum(axis=1), 1, min(2, len(gauges)))
         self._mates = np.array([[a == b for b in places] for a in places])
         free = 1.0 - np.einsum("ij,ji->i", strain_map.rows, strain_map.inverse)
         redundant = free > 1e-6
-        # The mean square of a residual is one; a gauge that no other one checks has none.
+        # Makes the mean square of a residual one; a gauge that no other one checks has no residual.
         self._weight = np.where(
             redundant, 1.0 / (self._resolution**2 * np.maximum(free, 1e-6)), 0.0
         )
@@ -136,7 +136,7 @@ class GaugeHealth:
         self.doubted[list(indices)] = True
 
     def update(self, strain):
-        """Judge the readings, shape (gauges,), of a new sample, on the control path."""
+        """Judge the readings, shape (gauges,), of a new sample; runs on the control path."""
         self.health[:] = GOOD
         if self._all_well(strain):
             return
@@ -156,7 +156,7 @@ class GaugeHealth:
             self._judge_residual(strain)
 
     def _all_well(self, strain):
-        """Whether all is well, as in nearly all samples; if so, the readings are taken note of."""
+        """Whether all gauges are good, as in nearly all samples; if so, the readings are noted."""
         if self._holding or np.count_nonzero(self.doubted):
             return False
         if not self._kernels.all_well(
@@ -211,7 +211,7 @@ class GaugeHealth:
         return self.strain_map.amplitudes_without(self.lost, strain, out)
 
     def _left_out(self, strain):
-        # A bad gauge comes back after a while only, so that a loose wire does not switch maps at each contact.
+        # A bad gauge is used again only after a while, so that a loose wire does not switch maps at each contact.
         held = tuple(np.flatnonzero(self._hold).tolist())
         if self.strain_map.possible_without(held):
             return held
@@ -246,15 +246,15 @@ class GaugeHealth:
 
 
 class BiasCalibration:
-    """Computes the bias of the gauges from the last samples, of an arm at rest.
+    """Computes the bias of the gauges from the last samples of an arm at rest.
 
     Parameters
     ----------
     model : ArmModel
     strain_map : StrainMap
-        With the rows of the gauges.
+        Strain map with the rows of the gauges.
     samples : int
-        How many samples are averaged.
+        Number of samples that are averaged.
     """
 
     #: Mean joint speed [rad/s], and span of the joint angle beyond two encoder counts [rad], of an arm at rest.
@@ -282,7 +282,7 @@ class BiasCalibration:
         self.count, self._next = 0, 0
 
     def push(self, sample):
-        """Keep a sample that has strains, on the control path."""
+        """Keep a sample that has strains; runs on the control path."""
         row = self._kept[self._next]
         self._keep(sample.position, sample.velocity, sample.torque, sample.strain, row)
         self._next = (self._next + 1) % self.samples
@@ -296,8 +296,8 @@ class BiasCalibration:
     def bias(self):
         """The new bias, shape (gauges,) [strain].
 
-        A `MessageError` if there are too few samples, a gauge is bad, or the arm is not at rest; a `ModelError` if it
-        has no static deflection here.
+        Raises a `MessageError` if there are too few samples, a gauge is bad, or the arm is not at rest, and a
+        `ModelError` if it has no static deflection here.
         """
         if self.count < self.samples:
             raise MessageError(

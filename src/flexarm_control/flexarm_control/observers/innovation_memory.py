@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What a filter's past innovations tell about the next one.
+r"""Predicts a filter's next innovation from its past ones.
 
-A Kalman filter whose model were right would leave white innovations. Vibration that its model lacks, and noise of
-another colour than it assumes, come back in them after some samples. A noise model in series with the filter,
+A Kalman filter with the right model leaves white innovations. Vibration that its model lacks, and noise of another
+colour than it assumes, come back in them after some samples. A noise model in series with the filter,
 
 .. math::
     \hat\nu_k = \sum_{l=1}^{L} A_l\,\nu_{k-l},
 
 predicts that part (Ljung, System Identification, 1999, 3.2: the prediction of a model with coloured noise). The
-matrices A_l, all gauges on all gauges, follow on line by recursive least squares without forgetting,
+matrices A_l, from all gauges to all gauges, are estimated online by recursive least squares without forgetting,
 
 .. math::
     k = \frac{P\varphi}{1 + \varphi^TP\varphi}, \quad \Theta \leftarrow \Theta + k(\nu - \Theta^T\varphi)^T, \quad
     P \leftarrow P - k\varphi^TP,
 
-with the last innovations :math:`\varphi`, each in units of its gauge's noise, and a wide prior about zero. The filter's
-state does not depend on it.
+where :math:`\varphi` are the last innovations, each in units of its gauge's noise, with a wide prior about zero. The
+filter's state does not depend on this prediction.
 """
 
 import numpy as np
 
-#: Variance of the prior of the coefficients, of innovations in units of the noise.
+#: Prior variance of the coefficients, for innovations in units of the noise.
 PRIOR = 10.0
 
 
@@ -30,7 +30,7 @@ class InnovationMemory:
     Parameters
     ----------
     noise : ndarray, shape (g,)
-        Of each gauge [-], above zero.
+        Noise of each gauge [-], above zero.
     order : int
         L; 0: the prediction is zero.
 
@@ -39,7 +39,7 @@ class InnovationMemory:
     learning : bool
         Whether coefficients follow the innovations; set to False to keep them.
     coefficients : ndarray, shape (L g, g)
-        The A_l transposed, the newest sample's first.
+        The transposed A_l, that of the newest sample first.
     """
 
     def __init__(self, noise, order):
@@ -50,15 +50,15 @@ class InnovationMemory:
         self._P = PRIOR * np.eye(order * g)
 
     def forget_past(self):
-        """After a gap: the next innovation follows from none before."""
+        """Forget the past innovations after a gap, so that none predicts the next one."""
         self._past[:] = 0.0
 
     def predict(self):
-        """The next innovation, shape (g,) [-]."""
+        """The predicted next innovation, shape (g,) [-]."""
         return self._noise * (self._past @ self.coefficients)
 
     def take(self, innovation):
-        """Learn from an innovation (g,) and remember it; NaN, of a gauge that is left out: nothing is learnt."""
+        """Learn from an innovation (g,) and remember it; with NaN, for a gauge that is left out, nothing is learnt."""
         if not self._past.size:
             return
         known = np.isfinite(innovation)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Kalman filter of joints and modes, from noise levels in physical units.
+r"""Kalman filter of joints and modes, with noise levels in physical units.
 
 The state x = (q, delta, qd, delta_d) moves as in `motion`, under the applied torque and under unknown white forces:
-torque of density ``torque_noise`` at the joints, ``modal_force_noise`` on the modes. Each sample measures the joint
-positions and the modal amplitudes, y = C x = (q, delta) + v. Joint velocities are not needed.
+torques of density ``torque_noise`` at the joints, and ``modal_force_noise`` on the modes. Each sample measures the
+joint positions and the modal amplitudes, y = C x = (q, delta) + v. Joint velocities are not needed.
 With P the covariance of the error,
 
 .. math::
@@ -14,15 +14,15 @@ With P the covariance of the error,
 (Joseph's form, which stays positive despite rounding). R contains the encoders' variance and, for the amplitudes, the
 gauges' noise through the strain map: :math:`R_\delta = W\,\mathrm{diag}(\sigma_i^2)\,W^T` with its weighted inverse W,
 which includes the gain. An encoder of N counts rounds to steps of :math:`2\pi/N`. Its variance step^2/12 is taken as
-white, which is right while the joint moves by more than a step per sample, and wrong at rest.
+white. This is right while the joint moves by more than a step per sample, and wrong at rest.
 
 Lost samples make the step longer: P grows accordingly, and the torque is held over the gap.
 The normalised innovation squared :math:`\nu^T S^{-1}\nu` is chi-squared with n + m degrees of freedom if all
-assumptions hold. `consistent` becomes False when more than a tenth of the last fifty or so exceed the 99.9 % bound:
+assumptions hold. `consistent` becomes False when more than a tenth of the last fifty or so exceed the 99.9 % bound;
 then the noise levels are too low, or the model is wrong.
 
-The recursion of P does not depend on the measurements. Once it has settled, for one time step and configuration,
-gain and covariance are kept until either changes.
+The recursion of P does not depend on the measurements. Once it has settled for a time step and configuration, gain and
+covariance are kept until either changes.
 """
 
 from contextlib import suppress
@@ -41,7 +41,7 @@ from .motion import Motion
 
 NOISE = (
     parameter("strain_noise", 0.0, "strain", 0.0, 1e-2).described(
-        "Noise of every gauge, rms; 0: from the arm file, bits included, or 1e-6 if it has none."
+        "Noise of every gauge, rms; 0: from the arm file, rounding included, or 1e-6 if it has none."
     ),
     parameter("position_noise", 0.0, "rad", 0.0, 1.0).described(
         "Noise of the joint positions, rms; 0: from the arm file's encoder_counts, or 1e-5 rad if it has none."
@@ -50,7 +50,7 @@ NOISE = (
         "Noise of the modal amplitudes, rms, of an arm whose file has no gauges."
     ),
     parameter("torque_noise", [0.01], "N m s^0.5", 1e-9, 1e6, length="joints").described(
-        "Unknown torque at each joint: root of the spectral density; an error of rms s that lasts t: s sqrt(2 t)."
+        "Unknown torque at each joint: root of the spectral density; for an error of rms s that lasts t: s sqrt(2 t)."
     ),
     parameter("modal_force_noise", 0.001, "N s^0.5, N m s^0.5", 0.0, 1e6).described(
         "Unknown force on every mode: root of the spectral density."
@@ -69,7 +69,7 @@ class Kalman(Observer):
     state : ndarray, shape (N,)
         (q, delta, qd, delta_d).
     covariance : ndarray, shape (N, N)
-        Of the error of `state`.
+        Covariance of the error of `state`.
     measurement_covariance : ndarray, shape (n + m, n + m)
         R.
     """
@@ -83,7 +83,7 @@ class Kalman(Observer):
     SETTLED = 0.1
     #: P has settled once no variance changes by more than this fraction per sample.
     STEADY = 1e-9
-    #: Inconsistent: more than a fraction `TOO_MANY` of the last 1/`RECENT` innovations are beyond this quantile.
+    #: Inconsistent if more than a fraction `TOO_MANY` of the last 1/`RECENT` innovations are beyond this quantile.
     QUANTILE, TOO_MANY, RECENT = 0.999, 0.1, 0.02
 
     def __init__(self, model, parameters):
@@ -93,7 +93,7 @@ class Kalman(Observer):
         self.innovation = np.zeros(m)
         self.covariance_diagonal = np.zeros(2 * m)
         self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
-        # Of the last sample: what the next one is taken to have.
+        # Torque and period of the last sample, which the next one is assumed to have, too.
         self._torque, self._period = np.zeros(n), 0.0
         self._assume()
         self.state, self.covariance = np.zeros(2 * self._p), np.zeros((2 * self._p,) * 2)
@@ -102,7 +102,7 @@ class Kalman(Observer):
         self._prepare()
 
     def _assume(self):
-        """R, the density of the forces, and the bound of the innovations, from the parameters."""
+        """Set R, the density of the forces, and the bound of the innovations, from the parameters."""
         model, m = self.model, self._p - self._n
         strain_map = StrainMap(model) if model.arm.gauges else None
         self._covariance_without = lru_cache(
@@ -115,7 +115,7 @@ class Kalman(Observer):
         self._measured = np.zeros(self._p)
 
     def _bound_of(self, count):
-        """The bound of an innovation squared of so many measurements."""
+        """The bound of the normalised innovation squared of `count` measurements."""
         return float(2.0 * gammaincinv(0.5 * max(count, 1), self.QUANTILE))  # of chi-square
 
     def _prepare(self):
@@ -144,7 +144,7 @@ class Kalman(Observer):
         self._steady = False
 
     def rest_at(self, amplitude):
-        """As `Observer.rest_at`: the old bias, which looked like motion, is in no later innovation."""
+        """As `Observer.rest_at`: the old bias, which looked like motion, affects no later innovation."""
         n, p = self._n, self._p
         self.state[n:p], self.state[p : 2 * p] = amplitude, 0.0
         self._foreseen = None
@@ -193,14 +193,14 @@ class Kalman(Observer):
         self._publish()
 
     def _predict(self, torque, dt):
-        """The predicted state, and the step that the covariance makes."""
+        """The predicted state, and the step for the covariance."""
         foreseen, self._foreseen = self._foreseen, None
         if foreseen is None or foreseen.period != round(dt, 5):
             foreseen = self.motion.foresee(self.state, self._torque, dt)
         return self.motion.go_on(foreseen, torque, dt), foreseen.step
 
     def _foresee(self):
-        """Begin the prediction of the next sample, whose torque and time step are taken to be this one's."""
+        """Begin the prediction of the next sample; its torque and time step are assumed to be those of this one."""
         self._foreseen = self.motion.foresee(self.state, self._torque, self._period)
 
     def _innovations(self, innovation):
@@ -208,7 +208,7 @@ class Kalman(Observer):
         self.innovation[:] = innovation[self._n :]
 
     def _output(self, x):
-        """C x: what is measured of a state (N,), or of the columns of a matrix (N, k)."""
+        """C x: the measured part of a state (N,), or of the columns of a matrix (N, k)."""
         return x[: self._p]
 
     def look_ahead(self):
@@ -218,7 +218,7 @@ class Kalman(Observer):
         self._foresee()
         if not self.converged or self._steady:
             return
-        with suppress(MessageError):  # to be raised by the sample, if it comes so
+        with suppress(MessageError):  # the sample itself raises it, if it comes so
             self._ahead = step, self.measurement_covariance, self._corrected(step)
 
     def _recursion(self, step):
@@ -233,7 +233,7 @@ class Kalman(Observer):
         self.covariance[:] = P
 
     def _corrected(self, step):
-        """Covariance, root of the innovation's, K^T, and whether the variances stay, after a step and a measurement."""
+        """After a step and a measurement: covariance, root of the innovation's, K^T, and whether the variances stay."""
         R = self.measurement_covariance
         P = step.Phi @ self.covariance @ step.Phi.T
         P += step.Q
@@ -273,8 +273,8 @@ class Kalman(Observer):
 def measurement_covariance(model, parameters, strain_map, lost):
     """R of joint positions and modal amplitudes, shape (n + m, n + m) [rad^2, m^2].
 
-    `parameters` are those of `NOISE`; `strain_map` is the model's, None without gauges; the amplitudes are made without
-    the `lost` gauges, whose indices these are.
+    `parameters` are those of `NOISE`. `strain_map` is the model's, None without gauges. `lost` has the indices of
+    gauges that are left out of the amplitudes.
     """
     n, m = model.n_joints, model.n_modes
     out = np.zeros((n + m, n + m))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Reduced-order Luenberger observer of the modal rates, from the boundary layer's model (11).
 
-Over a sample of length h under constant torque u the fast subsystem moves exactly by
+Over a sample of length h with constant torque u, the fast subsystem moves exactly by
 
 .. math::
     \begin{bmatrix}\delta\\ \dot\delta\end{bmatrix}_k
@@ -9,17 +9,17 @@ Over a sample of length h under constant torque u the fast subsystem moves exact
       \begin{bmatrix}\delta\\ \dot\delta\end{bmatrix}_{k-1}
     + \begin{bmatrix}\Gamma_1\\ \Gamma_2\end{bmatrix} u .
 
-The amplitudes are measured, the rates are predicted and corrected by the prediction error of the amplitudes,
+The amplitudes are measured. The rates are predicted, and corrected by the prediction error of the amplitudes,
 
 .. math::
     \hat{\dot\delta}_k = \Phi_{21}\delta_{k-1} + \Phi_{22}\hat{\dot\delta}_{k-1} + \Gamma_2 u
     + L\,[\delta_k - \Phi_{11}\delta_{k-1} - \Phi_{12}\hat{\dot\delta}_{k-1} - \Gamma_1 u],
 
-with :math:`L = (\Phi_{22} - e^{-p h}I)\Phi_{12}^{-1}`, which leaves the error
+with :math:`L = (\Phi_{22} - e^{-p h}I)\Phi_{12}^{-1}`. This leaves the error
 :math:`e_k = e^{-ph}e_{k-1}`: one pole p for all modes and for any time step up to a quarter period of the
 fastest mode. Over a longer gap (lost samples) the rates are predicted but not corrected, L = 0.
 
-The joint torque is the applied one, from the sample. Friction and gravity, which are in g2 of (6), act with it: u
+The joint torque is the applied one, from the sample. Friction and gravity, which are in g2 of (6), act with it. So u
 stands for (u - f1, f2) at the sample's joint position and velocity, constant over the sample.
 """
 
@@ -58,7 +58,7 @@ class Luenberger(Observer):
         self._max_step = 0.5 * np.pi / model.frequencies().max(initial=1e-9)
 
     def design(self, dt, q):
-        """Transition of (11) over dt and the gain L; at rest, in configuration q.
+        """Transition of (11) over dt, and the gain L, at rest in configuration q.
 
         Returns
         -------
@@ -78,7 +78,7 @@ class Luenberger(Observer):
         return Phi, Gamma, L
 
     def _linearised(self, *q):
-        """Of a configuration: the `Sampling` of (11), and its forces (2m, n + m)."""
+        """The `Sampling` of (11) in a configuration, and its force matrix (2m, n + m)."""
         m, n = self.model.n_modes, self.model.n_joints
         terms = self.model.terms(np.array(q), np.zeros(n))
         _, _, H21, H22 = terms.partition()

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Prediction of an arm's motion from sample to sample, for observers.
 
-With the state x = (q, delta, qd, delta_d), the equations of motion :math:`\dot x = f(x, u)` and the linearisation
-A of f at rest in the present configuration, a step of length h under constant torque is the exponential Euler
+The state is x = (q, delta, qd, delta_d), with the equations of motion :math:`\dot x = f(x, u)`. A is the linearisation
+of f at rest in the present configuration. A step of length h under constant torque is the exponential Euler
 (Rosenbrock) step
 
 .. math:: x_{k+1} = x_k + \Gamma f(x_k, u), \qquad \Gamma = \int_0^h e^{As}ds,
 
-exact for any h where f is linear. f is affine in the torque, so that most of a step is known before its torque is:
-`Motion.foresee`. The nonlinear parts of f (centrifugal and Coriolis forces, Coulomb friction,
+exact for any h if f is linear. f is affine in the torque, so most of a step can be computed before its torque is known
+(`Motion.foresee`). The nonlinear parts of f (centrifugal and Coriolis forces, Coulomb friction,
 gravity's curvature) are held over the step. Forces of spectral density S on joints and modes (white noise) add
 
 .. math:: Q = \int_0^h e^{As}\,B S B^T e^{A^Ts}ds, \qquad B = \begin{bmatrix}0\\ M^{-1}\end{bmatrix}
@@ -18,9 +18,9 @@ gradient of Coulomb friction at rest is wrong for a moving joint.
 
 Designs are made per time step rounded to 10 us and configuration rounded to 0.1 rad, so that they do not depend on
 the past. The rest of the time step, at most 5 us, is corrected to second order of the linear motion. Linearisations
-are kept per configuration. There a time step is a short series and some products (`flexarm_dynamics.sampling`), without
-a matrix exponential: a source's stamps may jitter and its samples get lost, and an arm that moves comes to a new
-configuration now and then.
+are kept per configuration. With one, a new time step takes only a short series and some products
+(`flexarm_dynamics.sampling`), no matrix exponential. This matters because a source's stamps may jitter, its samples may
+get lost, and an arm that moves reaches a new configuration now and then.
 """
 
 from dataclasses import dataclass
@@ -32,13 +32,13 @@ from scipy.linalg.lapack import dposv
 from flexarm_dynamics.linear import state_matrix
 from flexarm_dynamics.sampling import Sampling, Step
 
-#: Steps of the central differences: sizes of a joint angle, a deflection and their rates [rad, m, rad/s, m/s].
+#: Step of the central differences of a joint angle, a deflection and their rates [rad, m, rad/s, m/s].
 DIFFERENCE = 1e-5
-#: Time steps that designs are kept for; a new one costs some 20 us.
+#: Number of time steps that designs are kept for; a new one costs some 20 us.
 KEPT = 256
-#: Configurations that linearisations are kept for; a new one costs a millisecond or so.
+#: Number of configurations that linearisations are kept for; a new one costs a millisecond or so.
 CONFIGURATIONS = 64
-#: A time step that is so close to a design's is the design's [s].
+#: A time step this close to a design's counts as the design's [s].
 EXACT = 1e-12
 
 
@@ -97,7 +97,7 @@ class Motion:
         return self._linear(*q).step(dt)
 
     def step_for(self, dt, position):
-        """The kept `Step` for a time step and configuration like these."""
+        """The kept `Step` for the rounded time step and configuration."""
         return self._kept(round(dt, 5), *np.round(position, 1).tolist())
 
     def advance(self, x, torque, dt, step):
@@ -106,7 +106,7 @@ class Motion:
         return _with_rest(x + step.Gamma @ rate, rate, dt, step)
 
     def foresee(self, x, torque, dt):
-        """The `Foreseen` step over dt [s] from a state (N,), in which a torque (n,) [N m] is expected."""
+        """The `Foreseen` step over dt [s] from a state (N,), with an expected torque (n,) [N m]."""
         n, size = self._n, self._size
         rate = self.model.derivative(x, torque)
         push = dposv(self.model.mass_matrix(x[:n], x[n:size]), self._onto_joints)[1]
@@ -115,7 +115,7 @@ class Motion:
         return Foreseen(round(dt, 5), step, torque.copy(), state, rate, push, moved)
 
     def go_on(self, foreseen, torque, dt):
-        """As `advance`, by a `foreseen` step of that period."""
+        """As `advance`, with a `foreseen` step of that period."""
         change, step = torque - foreseen.torque, foreseen.step
         rate = foreseen.rate
         if abs(dt - step.length) > EXACT:
@@ -125,7 +125,7 @@ class Motion:
 
 
 def _with_rest(out, rate, dt, step):
-    """What `step` gives, `out`, corrected for the rest of the time dt [s]; `rate` is f before the step."""
+    """The result `out` of `step`, corrected for the rest of the time dt [s]; `rate` is f before the step."""
     rest = dt - step.length
     if abs(rest) > EXACT:
         rate = step.Phi @ rate  # after the step

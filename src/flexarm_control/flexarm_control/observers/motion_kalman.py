@@ -1,28 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Kalman filter of the strains of an arm whose joints are moved with unknown torque.
 
-It needs no torque: the joints' motion is what excites the links. The state is
+It needs no torque, because the joints' motion excites the links. The state is
 :math:`x = (q, \delta, \dot q, \dot\delta, a, b, c)` with the joints' acceleration a, the gauges' bias b and the last
-samples c of the noise that all gauges share,
+samples c of the noise that all gauges share. It obeys
 
 .. math::
     \ddot q = a, \quad \dot a = -a/T + w_a, \quad
     \ddot\delta = M_{22}^{-1}\big(w_\delta - M_{21}a - h_2(q, \delta, \dot q, \dot\delta)\big), \quad
     \dot b = w_b, \quad c_k = \sum_l \alpha_l c_{k-l} + w_c,
 
-where M and h are those of (2), gravity and damping in h, and each w is white. Joint positions and strains are measured,
+where M and h are those of (2), with gravity and damping in h, and each w is white. Joint positions and strains are
+measured,
 
 .. math:: y = (q,\ g R\delta + b_0 + b + s c_k) + v,
 
 with the arm file's gains g, biases :math:`b_0` and rows R (`strain_map`), and s the ``common_noise`` of each gauge. The
 measured motion of the joints is the input; its noise is that of the encoders and of a. Step and update are those of
-`motion` and `kalman`. All gauges are used, also more than there are modes. One that is lost, or reads nothing, is left
-out.
+`motion` and `kalman`. All gauges are used, even if there are more than modes. A gauge that is lost, or reads nothing,
+is left out.
 
-What past innovations tell about the next one (``innovation_order``, `innovation_memory`) makes predicted strains
-better, and leaves the state as it is.
+Past innovations can predict the next one (``innovation_order``, `innovation_memory`). This improves predicted strains,
+and leaves the state as it is.
 
-A bias and a slow deflection differ only by what the motion makes of them: at rest the filter can't tell them apart
+A bias and a slow deflection differ only in how the motion affects them. At rest the filter can't distinguish them
 beyond ``bias_deviation``.
 """
 
@@ -40,9 +41,9 @@ from .kalman import NOISE, UNSTATED_STRAIN, Kalman, position_uncertainty
 from .motion import DIFFERENCE, EXACT, Motion
 
 _OF_STRAINS = {p.name: p for p in NOISE if p.name in ("strain_noise", "position_noise")}
-#: Variance of a reading that is none, over that of the gauge's noise.
+#: Ratio of the variance of a missing reading to that of the gauge's noise.
 NONE = 1e12
-#: Past innovations count for nothing after a step that is longer than the last one by this factor.
+#: Past innovations are forgotten after a step that is longer than the last one by this factor.
 GAP = 1.5
 
 
@@ -56,7 +57,7 @@ class MotionKalman(Kalman):
     strain_innovation : ndarray, shape (g,)
         Measured minus predicted strain; NaN for a gauge that is left out.
     strain_error : ndarray, shape (g,)
-        The same less what follows from past innovations.
+        The same, minus the prediction from past innovations.
     memory : InnovationMemory
     parameters_estimated : dict
         Bias of each gauge beyond the arm file's.
@@ -67,28 +68,28 @@ class MotionKalman(Kalman):
         _OF_STRAINS["strain_noise"],
         _OF_STRAINS["position_noise"],
         parameter("common_noise", [0.0], "strain", 0.0, 1e-2, length="gauges").described(
-            "What noise with one source, as of a supply, does to each gauge, rms; strain_noise is the rest."
+            "Noise of each gauge that comes from one source, such as a supply, rms; strain_noise is the rest."
         ),
         parameter("common_memory", [0.0], "-", -2.0, 2.0).described(
-            "How the shared noise follows from its last samples, the newest first; [0.0]: it is white."
+            "Coefficients of the common noise on its last samples, newest first; [0.0]: it is white."
         ),
         parameter("jerk_noise", [20.0], "rad s^-2.5", 1e-6, 1e6, length="joints").described(
             "Unknown change of each joint's acceleration: root of the spectral density."
         ),
         parameter("acceleration_time", 0.1, "s", 1e-3, 1e3).described(
-            "Time in which a joint's acceleration is forgotten."
+            "Time constant in which a joint's acceleration is forgotten."
         ),
         parameter(
             "bending_force_noise", [0.1], "N s^0.5, N m s^0.5", 0.0, 1e6, length="modes"
         ).described("Unknown force on each mode: root of the spectral density."),
         parameter("bias_deviation", 1e-5, "strain", 0.0, 1e-2).described(
-            "How far the gauges' bias may be off the arm file's at the start, rms."
+            "Deviation of the gauges' bias from the arm file's at the start, rms."
         ),
         parameter("bias_noise", 1e-6, "strain s^-0.5", 0.0, 1e-2).described(
-            "Random walk of the bias, per root of a second; the arm file's drift where that is larger."
+            "Random walk of the bias, per root of a second, or the arm file's drift if that is larger."
         ),
         parameter("innovation_order", 0, "-", 0, 64).described(
-            "Strains are also predicted from so many past innovations of all gauges, learnt on line; 0: from none."
+            "Number of past innovations of all gauges that also predict strains, as learnt online; 0: none."
         ),
     )
 
@@ -100,7 +101,7 @@ class MotionKalman(Kalman):
         super().__init__(model, parameters)
 
     def _assume(self):
-        """The noise is stated in `_prepare`, with the state that it acts on."""
+        """Do nothing, since `_prepare` sets the noise, with the state that it acts on."""
 
     def _prepare(self):
         model, values = self.model, self.parameters
@@ -132,7 +133,7 @@ class MotionKalman(Kalman):
         self._left_out()
 
     def _left_out(self, missing=()):
-        """R and the bound of the innovations without lost gauges and those whose reading is missing."""
+        """Set R and the bound of the innovations, without lost gauges and those whose readings are `missing`."""
         self._out = tuple(sorted({*self.gauges_lost, *missing}))
         variance = self._full.copy()
         variance[[self._n + i for i in self._out]] *= NONE
@@ -161,7 +162,7 @@ class MotionKalman(Kalman):
         self._publish()
 
     def _take(self, sample):
-        """The measurement y, gauges that read nothing as predicted."""
+        """Set the measurement y; gauges that read nothing count as left out."""
         if sample.strain is None:
             hint = "have the driver send strain, or use another observer.type"
             raise MessageError(
@@ -222,13 +223,13 @@ class MotionKalman(Kalman):
         return self.motion.advance(self.state, torque, dt, step), step
 
     def _foresee(self):
-        """Nothing: no torque is waited for."""
+        """Do nothing, since no torque is needed."""
 
     def _output(self, x):
         return self._C @ x
 
     def _innovations(self, innovation):
-        """A gauge that is left out has no innovation."""
+        """Publish the innovation of a sample; a gauge that is left out has none."""
         innovation[[self._n + i for i in self._out]] = 0.0
         self.strain_innovation[:] = innovation[self._n :]
         self.strain_innovation[list(self._out)] = np.nan
@@ -250,7 +251,7 @@ class PrescribedMotion(Motion):
     values : mapping
         Checked values of `MotionKalman.PARAMETERS`.
     gauges : int
-        Their number.
+        Number of gauges.
     memory : ndarray, shape (k,)
         Coefficients of the shared noise.
 
@@ -262,7 +263,7 @@ class PrescribedMotion(Motion):
     Raises
     ------
     ParameterError
-        For a shared noise that would grow.
+        If the shared noise would grow.
     """
 
     def __init__(self, model, values, gauges, memory):
@@ -318,7 +319,7 @@ class PrescribedMotion(Motion):
 
     def _design(self, dt, *q):
         step = super()._design(dt, *q)
-        # The shared noise goes from sample to sample, however long that takes.
+        # The shared noise changes by sample, however long a sample takes.
         last = slice(self._moving + self._gauges, self.size)
         Phi, Q = step.Phi.copy(), step.Q.copy()
         Phi[last, last] = self._companion
@@ -338,7 +339,7 @@ class PrescribedMotion(Motion):
 
 
 def modal_forces(model, q, qd, delta, delta_d):
-    """h_2 of (2): what the modes must give at zero acceleration, shape (m,)."""
+    """h_2 of (2): the modal forces at zero acceleration, shape (m,)."""
     n = model.n_joints
     if hasattr(model, "forces"):  # of a chain: much cheaper than all terms
         return model.forces(q, qd, delta, delta_d)[n:]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The payload, estimated from strains and joint torques."""
+"""Estimate of the payload from strains and joint torques."""

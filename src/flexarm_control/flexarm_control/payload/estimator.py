@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How heavy the payload is, from what the gauges and the joint torques read: recursive least squares on (2).
+r"""Estimates the payload from strains and joint torques, by recursive least squares on (2).
 
-In the same mode shapes (2) is affine in the payload, theta times that of the arm file. With the regressor Y, the
-difference of (2) for two payloads and for one, its mode rows (s) and its joint rows (u) read
+For given mode shapes, (2) is affine in the payload, which is theta times that of the arm file. The regressor Y is the
+difference of (2) for two payloads and for one. With it, the mode rows (s) and the joint rows (u) read
 
 .. math::
     Y_s\,(\theta - 1) &= -\left(M_{21}\ddot q + M_{22}\ddot\delta + f_2 + C_2\dot\delta + K_2\delta\right), \\
     Y_u\,(\theta - 1) &= u - \left(M_{11}\ddot q + M_{12}\ddot\delta + f_1 + C_1\dot\delta + K_1\delta\right).
 
-q, delta and u go through one `LowPass`, which has their derivatives. Each set of rows is solved by itself, with the
-weights W (the modes' compliance; one over the square of a joint's friction) and sums over time that forget with the
-time constant `MEMORY`. A set's interval has half the width
+q, delta and u pass the same `LowPass`, which gives their derivatives. Each set of rows is solved by itself, with the
+weights W (the modes' compliance, or one over the square of a joint's friction) and with sums over time that forget with
+the time constant `MEMORY`. The half width of a set's interval is
 
 .. math::
     h_s &= \kappa\,\frac{|Y_s^TWK_2\delta|}{Y_s^TWY_s}
@@ -19,11 +19,11 @@ time constant `MEMORY`. A set's interval has half the width
            + 3\sigma_u,
 
 for links that are stiffer by a fraction kappa (`STIFFNESS`), with the zero and noise epsilon_0 of each gauge, a drive
-that gives more torque by gamma (`DRIVE`), friction F that is not modelled, and sigma of the residual. Sums are taken
-before the magnitude: an error that goes against theta while the arm accelerates and with it while it brakes is none.
+that gives more torque by gamma (`DRIVE`), unmodelled friction F, and sigma of the residual. Sums are taken before the
+magnitude, so an error that lowers theta while the arm accelerates and raises it while it brakes cancels.
 
-The two sets check each other: a gauge that is dead, stuck or of the wrong sign moves the first alone, a drive or
-friction the second alone. theta lies in both intervals, weighted by one over their squares. It may be used when each
+The two sets check each other: a gauge that is dead, stuck or of the wrong sign changes only the first, a drive or
+friction only the second. theta lies in both intervals, weighted by one over their squares. It may be used if each
 interval is narrow enough, they overlap, the residuals are small, and theta is between 0 and its limit.
 """
 
@@ -42,27 +42,28 @@ OFF, REST, ONLINE = "off", "rest", "online"
 
 PARAMETERS = (
     parameter("payload_estimate", OFF, choices=(OFF, REST, ONLINE), read_only=True).described(
-        "Whether strains and torques weigh the payload: while the arm rests under gravity, or in motion, too. The"
-        " control takes the estimate over at rest, where the arm file's payload is outside its interval."
+        "Whether the payload is estimated from strains and torques. rest: while the arm rests under gravity; online:"
+        " also in motion. The control takes the estimate over at rest, if the arm file's payload is outside its"
+        " interval."
     ),
     parameter("payload_limit", 1.0 + TOLERANCE, "-", 1.0, 100.0, read_only=True).described(
-        "Heaviest payload that is believed, in parts of the arm file's: observer.payload_tolerance and one."
+        "Largest payload that is accepted, as a multiple of the arm file's: observer.payload_tolerance plus one."
     ),
 )
 
 #: Fractions by which links may be stiffer and drives stronger than in the arm file [-].
 STIFFNESS, DRIVE = 0.15, 0.05
-#: Friction that no file states, of the torque limit; and of the file's Coulomb friction, at rest and in motion [-].
+#: Unmodelled friction, of the torque limit; and of the file's Coulomb friction, at rest and in motion [-].
 UNSTATED, STICKING, SLIDING = 0.01, 1.0, 0.3
-#: Time between two evaluations [s], and time constants of the sums, of the time in which they grow [s].
+#: Time between two evaluations [s], and time constants of the sums, in the time in which they grow [s].
 INTERVAL, MEMORY = 0.008, {REST: 1.0, ONLINE: 3.0}
 #: Joints that turn more slowly may stick [rad/s].
 SLOW = 0.01
-#: theta may be used when half the interval of each set, and that of both together, are smaller, over theta or 1 [-].
+#: theta may be used if the half width of each set's interval, and of both together, are smaller, over theta or 1 [-].
 WIDE, NARROW = 2.0, 0.4
 #: Fraction of the square of strains or torques that the fit may leave [-].
 MISFIT = 0.04
-#: Nothing is learnt while one payload more strains the links less than this times what the gauges' zeros may [-].
+#: Nothing is learnt while one more payload strains the links less than this times what the gauges' zeros may [-].
 EXCITED = 0.1
 #: The sums must have grown for this long [s].
 LEARNT = 0.5
@@ -79,7 +80,7 @@ class _Set:
         self._sums[:], self._whole[:], self._time = 0.0, 0.0, 0.0
 
     def add(self, Y, r, W, measured, errors, dt):
-        """Add rows Y x = r with the weights W; `errors` (size,) are x's numerators per unit of what may be wrong."""
+        """Add rows Y x = r with the weights W; `errors` (size,) are x's numerators per unit of each possible error."""
         keep, WY = np.exp(-dt / self._memory), W * Y
         self._sums *= keep
         self._whole *= keep
@@ -93,7 +94,7 @@ class _Set:
         return self._time >= LEARNT
 
     def solve(self, scales, corner):
-        """theta, half the width of its interval for errors of the size `scales`, and the misfit."""
+        """theta, the half width of its interval for errors of the size `scales`, and the misfit."""
         A, b, rr, total = self._whole
         misfit = max(rr - b * b / A, 0.0)
         independent = max(min(self._time, self._memory) * corner / 6.0, 1.0) * self.rows
@@ -111,18 +112,18 @@ class PayloadEstimator:
     Parameters
     ----------
     model : ArmModel
-        Of the arm file.
+        Model of the arm file's arm.
     mode : str
         `REST` or `ONLINE`.
     limit : float
-        Largest theta that is believed [-].
+        Largest theta that is accepted [-].
 
     Attributes
     ----------
     value, low, high : float
         theta and its interval [-]; NaN while there is none.
     strain, torque : (float, float)
-        theta of each set of rows, and half the width of its interval.
+        theta of each set of rows, and the half width of its interval.
     reason : str
         Why theta may not be used; empty when it may.
     """
@@ -164,7 +165,7 @@ class PayloadEstimator:
         self.reason = reason
 
     def restart(self):
-        """The next sample does not follow the last one."""
+        """Begin again: the next sample does not follow the last one."""
         self._fresh, self._since, self._settling = True, 0.0, 0.0
 
     def note(self, position, amplitude, torque, dt):
@@ -180,7 +181,7 @@ class PayloadEstimator:
         self._settling -= dt
 
     def update(self, resting):
-        """Learn from the samples noted, where it is time to; `resting`: the reference does not move."""
+        """Learn from the noted samples, if it is time to; `resting`: the reference does not move."""
         if self._fresh or self._since < INTERVAL:
             return
         dt, self._since = self._since, 0.0
@@ -215,7 +216,7 @@ class PayloadEstimator:
             self._judge()
 
     def _judge(self):
-        """Value, interval and reason from the sums."""
+        """Set value, interval and reason from the sums."""
         found = [s.solve(e, self._corner) for s, e in zip(self._sets, self._scales, strict=True)]
         (s, h_s, misfit_s), (u, h_u, misfit_u) = found
         self.strain, self.torque = (s, h_s), (u, h_u)

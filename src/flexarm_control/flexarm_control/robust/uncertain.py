@@ -13,8 +13,11 @@ from .loop import sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
-#: Fraction of the decay that is asked of loops with another gain or delay.
+#: Fraction of the decay that is asked of loops without delay, and of those with the file's modes alone.
 UNLIKELY = 0.5
+#: The same of loops with another gain or a longer delay. They are there to leave a margin: such a loop must hold, and
+#: may be slow. With a half in place of a quarter, light hubs are slow with the gain and delay that the arm has.
+MARGIN = 0.25
 #: Of an arm that sticks: parts of the damper that its Coulomb friction is at rest, as movements of several sizes meet
 #: it, and the fraction that is asked of each. At rest it creeps: friction over stiffness is its time.
 STICKING = {1.0: 0.1, 0.1: 0.3}
@@ -167,7 +170,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
                     continue
     for gain in uncertainty.gain:
         out.append(
-            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}{here}", UNLIKELY)
+            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}{here}", MARGIN)
         )
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
     out.append(
@@ -177,7 +180,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
             at[0],
             later,
             name=f"delay {1e3 * later.delay:.3g} ms{here}",
-            fraction=UNLIKELY,
+            fraction=MARGIN,
         )
     )
     own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))

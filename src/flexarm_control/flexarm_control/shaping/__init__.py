@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions shaped for arms that take positions: trajectories and streams in, the same without vibration out.
+"""Shapes motions for arms that take positions: trajectories and streams in, the same without vibration out.
 
 No model of the arm, no torque and no gauges are needed: frequencies and damping of the modes that ring are enough.
 """

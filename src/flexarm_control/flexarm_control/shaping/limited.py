@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The quickest time laws within limits: of jerk by Ruckig, of speed and acceleration along a path by TOPP-RA.
+"""Finds the quickest time laws, within limits of jerk by Ruckig, of speed and acceleration along a path by TOPP-RA.
 
-Ruckig (Berscheid & Kroeger 2021) joins two states in the shortest time within limits of speed, acceleration and jerk;
-from rest all joints stay on the straight line between, whose progress
-has the limits of the joints. TOPP-RA (Pham & Pham 2018) moves along the cubic spline
-through points, by length, in the shortest time within limits of speed and acceleration.
+Ruckig (Berscheid & Kroeger 2021) joins two states in the shortest time within limits of speed, acceleration and jerk.
+In a motion from rest, all joints stay on the straight line between both positions, and the progress on it keeps the
+limits of the joints. TOPP-RA (Pham & Pham 2018) moves along the cubic spline through points, by length, in the shortest
+time within limits of speed and acceleration.
 
-Both are libraries of their own, imported where they are used: `ruckig` and `toppra` on PyPI.
+Both are separate libraries, imported only where they are used: `ruckig` and `toppra` on PyPI.
 """
 
 import importlib
@@ -18,14 +18,14 @@ from flexarm_dynamics.errors import DesignError, TrajectoryError
 
 from .piecewise import PiecewiseMotion
 
-#: Points of the spline at which TOPP-RA keeps the limits, for each piece between two points; at least, and at most, in
-#: all beside the points themselves: each is a point of the motion, and a shaper multiplies them.
+#: Number of spline points at which TOPP-RA keeps the limits, for each piece between two given points; and minimum and
+#: maximum of their total without the given points. Each is a point of the motion, and a shaper multiplies them.
 GRID, FEWEST, MOST = 50, 100, 800
-#: A step of the grid that ends closer to a point than this part of it ends there.
+#: A step of the grid that ends closer to a given point than this fraction of the step ends at the point.
 CLOSE = 0.1
-#: Points closer to each other than this are one [rad].
+#: Points closer to each other than this count as one [rad].
 SAME = 1e-7
-#: Knots closer than this are one [s].
+#: Knots closer than this count as one [s].
 MOMENT = 1e-9
 
 
@@ -44,9 +44,9 @@ def jerk_limited(begin, end, velocity, acceleration, jerk) -> PiecewiseMotion:
     Raises
     ------
     DesignError
-        Where `ruckig` is not installed, or a limit is not given.
+        If `ruckig` is not installed, or a limit is not given.
     TrajectoryError
-        Where there is no such motion.
+        If there is no such motion.
     """
     ruckig = library("ruckig")
     begin, end = np.asarray(begin, float), np.asarray(end, float)
@@ -105,9 +105,9 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
     Raises
     ------
     DesignError
-        Where `toppra` is not installed, or a limit is not given.
+        If `toppra` is not installed, or a limit is not given.
     TrajectoryError
-        Where there is no such motion.
+        If there is no such motion.
     """
     toppra = library("toppra")
     points = np.asarray(points, float)
@@ -146,12 +146,12 @@ def time_optimal(points, velocity, acceleration) -> PiecewiseMotion:
 
 
 def _grid(length):
-    """Places (g,) at which the limits are kept: the points at `length` (k,), and between them equal steps."""
+    """Places (g,) at which the limits are kept: the points at `length` (k,), and equal steps between them."""
     count = int(np.clip(GRID * (length.size - 1), FEWEST, MOST))
     even = np.linspace(0.0, length[-1], count + 1)
     after = np.clip(np.searchsorted(length, even), 1, length.size - 1)
     apart = np.minimum(np.abs(even - length[after - 1]), np.abs(even - length[after]))
-    # Of a place as close as rounding to a point, the speeds differ by more than the way between them.
+    # If a place differs from a point only by rounding, the speeds differ by more than the distance allows.
     return np.union1d(even[apart > CLOSE * even[1]], length)
 
 
@@ -166,12 +166,12 @@ def _refuse_unlimited(limits):
 
 
 def library(name):
-    """One of the two libraries, `name`.
+    """Import one of the two libraries, `name`.
 
     Raises
     ------
     DesignError
-        Where it is not installed.
+        If it is not installed.
     """
     try:
         return importlib.import_module(name)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The modes that ring: their frequencies over the joints, and the shaper that takes them out.
+r"""The modes that ring: their frequencies as a function of the joints, and the shaper that removes them.
 
-Between the configurations at which frequencies were measured they are interpolated by inverse squared distance in the
+Frequencies are interpolated between the configurations at which they were measured, by inverse squared distance in the
 joints (Shepard 1968),
 
 .. math:: f(q) = \frac{\sum_c w_c(q) f_c}{\sum_c w_c(q)}, \qquad w_c = \lVert q - q_c\rVert^{-2}.
@@ -23,13 +23,13 @@ from ..motions.shapers import NONE, SHAPERS
 ROBUST, RETIMED = "robust", "retimed"
 KINDS = (*SHAPERS, ROBUST, RETIMED, NONE)
 
-#: Modes of several configurations that are closer than this fraction are one to a shaper of all of them [-].
+#: Modes of several configurations that are closer than this fraction count as one for a shaper of all of them [-].
 ALIKE = 0.02
 
 PARAMETERS = (
     parameter("type", ROBUST, choices=KINDS).described(
         "Shaper: robust is optimal for the spread of all modes in shaper.periods; retimed gives straight motions from "
-        "rest to rest a new time law, else it is robust; none passes motions as they are."
+        "rest to rest a new time law, and shapes others as robust; none passes motions as they are."
     ),
     parameter("frequencies", [], "Hz", 0.01, 1000.0, kind="float_array").described(
         "Natural frequencies of the modes to shape; with configurations, one row of modes after the other."
@@ -38,25 +38,25 @@ PARAMETERS = (
         "Damping ratios, as many as frequencies, or one for all."
     ),
     parameter("configurations", [], "rad", -1e3, 1e3, kind="float_array").described(
-        "Joint positions at which the frequencies were measured, one row after the other; empty: everywhere the same."
+        "Joint positions at which the frequencies were measured, one row after the other; empty: the same everywhere."
     ),
     parameter("spread", 0.15, "-", 0.0, 0.5).described(
-        "Of the types robust and retimed: frequencies may be off by this fraction."
+        "For the types robust and retimed: fraction by which frequencies may be off."
     ),
     parameter("periods", 1.0, "-", 0.25, 3.0).described(
-        "Of the types robust and retimed: how much longer a motion gets, in periods of the lowest mode."
+        "For the types robust and retimed: how much longer a motion gets, in periods of the lowest mode."
     ),
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """A shaper in phase of one mode: an impulse at phase 2 pi comes a period after one at 0.
+    """A shaper in the phase of one mode: an impulse at phase 2 pi comes a period after one at 0.
 
     Attributes
     ----------
     cycles : (k,) ndarray
-        Impulses, from 0, in periods of the mode [-].
+        Times of the impulses, from 0, in periods of the mode [-].
     amplitudes : (k,) ndarray
     mode : int
         Column of the frequencies.
@@ -75,23 +75,23 @@ class Modes:
     settings : mapping
         Checked values of `PARAMETERS`.
     joints : int
-        n, of the configurations.
+        Number n of joints in a configuration.
 
     Attributes
     ----------
     configurations : (c, n) ndarray
-        Empty where the frequencies are everywhere the same.
+        Empty if the frequencies are the same everywhere.
     frequencies, dampings : (c, modes) ndarrays
-        With one row at least [Hz], [-].
+        With at least one row [Hz], [-].
     spread, periods : float
-        Of the settings [-].
+        As in the settings [-].
 
     Raises
     ------
     ParameterError
-        Naming the parameter, where the numbers of values don't fit together.
+        If the numbers of values don't fit together; it names the parameter.
     DesignError
-        Where there is no such shaper.
+        If there is no such shaper.
     """
 
     def __init__(self, settings, joints):
@@ -142,7 +142,7 @@ class Modes:
                 )
 
     def _designed(self):
-        """Stages, one for each mode; one for all of them where their ratios must stay anyway."""
+        """Stages: one for each mode, or one for all of them if their ratios must stay anyway."""
         frequencies, dampings = self.frequencies.mean(axis=0), self.dampings.mean(axis=0)
         if self.kind == NONE:
             return ()
@@ -150,7 +150,7 @@ class Modes:
             lowest = int(np.argmin(frequencies))
             if (
                 self.kind == RETIMED
-            ):  # what can't be retimed gets one shaper for the modes of all rows
+            ):  # a motion that can't be retimed gets one shaper for the modes of all rows
                 frequencies, dampings = _different(self.frequencies.ravel(), self.dampings.ravel())
             train = robust_shapers.robust(frequencies, dampings, self.spread, self.periods)
             unit = self.mean_frequencies[lowest]
@@ -165,7 +165,7 @@ class Modes:
         )
 
     def scaled(self, factors):
-        """The same with frequencies times `factors` (modes,), everywhere."""
+        """The same modes with all frequencies times `factors` (modes,)."""
         other = copy.copy(self)
         other.frequencies = self.frequencies * factors
         other.stages = other._designed()
@@ -180,7 +180,7 @@ class Modes:
 
     @property
     def mean_frequencies(self):
-        """Of each mode over the configurations (modes,): those of a shaper that does not vary [Hz]."""
+        """Mean frequency of each mode over the configurations (modes,), for a shaper that does not vary [Hz]."""
         return self.frequencies.mean(axis=0)
 
     @property
@@ -191,7 +191,7 @@ class Modes:
 
     @property
     def max_duration(self):
-        """How much longer a motion gets at most [s]."""
+        """Largest time by which a motion gets longer [s]."""
         low = self.frequencies.min(axis=0) if self.varies else self.mean_frequencies
         return float(sum(s.cycles[-1] / low[s.mode] for s in self.stages))
 
@@ -201,7 +201,7 @@ class Modes:
         if len(self.frequencies) == 1:
             return np.repeat(self.frequencies, len(q), axis=0)
         squared = ((q[:, None] - self.configurations) ** 2).sum(axis=2)
-        # As products without the own factor, which is right at the configurations, too.
+        # Products without the own factor are right at the configurations, too.
         weights = np.stack(
             [np.delete(squared, c, axis=1).prod(axis=1) for c in range(squared.shape[1])], axis=1
         )
@@ -211,8 +211,8 @@ class Modes:
     def along(self, q):
         """Frequencies [Hz] and damping ratios, (k, modes) each, at joint positions (k, n), for motions that pass them.
 
-        Unlike `at`, they change evenly between two configurations: they are combined linearly, with the distances from
-        all configurations and a constant as functions, and kept between the smallest and the largest measured.
+        Unlike those of `at`, they change evenly between two configurations: they are a linear combination of a constant
+        and the distances from all configurations, kept between the smallest and the largest measured.
         """
         q, rows = np.asarray(q, float), len(self.frequencies)
         known = np.hstack([self.frequencies, self.dampings])
@@ -244,7 +244,7 @@ def _distances(q, other):
 
 
 def _different(frequencies, dampings):
-    """Modes (k,), without those that are `ALIKE` to one before."""
+    """Modes (k,), without those that are `ALIKE` to a previous one."""
     kept = []
     for i, frequency in enumerate(frequencies):
         if all(abs(frequencies[j] / frequency - 1.0) > ALIKE for j in kept):

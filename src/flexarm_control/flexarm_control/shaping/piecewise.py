@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions as piecewise polynomials: what a joint_trajectory_controller makes of the points of a trajectory.
+"""Motions as piecewise polynomials, as a joint_trajectory_controller interpolates the points of a trajectory.
 
 Points with positions alone are joined by lines, with velocities by cubic, with accelerations by quintic Hermite
-polynomials, see `flexarm_control.trajectory`. Before its first knot a motion stands, after its last one it holds.
+polynomials, see `flexarm_control.trajectory`. A motion rests before its first knot and after its last one.
 """
 
 import math
@@ -12,9 +12,9 @@ import numpy as np
 from ..motions.profiles import Motion
 from ..trajectory.path import hermite
 
-#: Coefficients of a polynomial: of degree 5 at most.
+#: Number of coefficients of a polynomial, of degree 5 at most.
 ORDER = 6
-#: Between the knots of a motion that stands [s].
+#: Time between the knots of a motion that stands [s].
 MOMENT = 1e-3
 
 
@@ -28,14 +28,14 @@ class PiecewiseMotion(Motion):
     coefficients : (k, 6, n) ndarray
         c_0 ... c_5 of each piece: the position is sum_i c_i x^i, x from the piece's first knot [s].
     fields : int
-        What points are needed to write it: 1: positions, 2: and velocities, 3: and accelerations.
+        Fields that points need to write it: 1: positions, 2: and velocities, 3: and accelerations.
     end : (n,) ndarray, optional
-        Where it ends, exactly; not given: as the last polynomial has it [rad].
+        Exact end position; if not given, that of the last polynomial [rad].
     """
 
     def __init__(self, knots, coefficients, fields, end=None):
         self.knots, self.coefficients, self.fields = knots, coefficients, fields
-        # Coefficients of velocity and acceleration, and of the ends, beyond which the motion is constant.
+        # Coefficients of velocity and acceleration, and the ends, beyond which the motion is constant.
         self._derived = [coefficients]
         for order in (1, 2):
             factors = [math.perm(i, order) for i in range(order, ORDER)]
@@ -68,7 +68,7 @@ class PiecewiseMotion(Motion):
 
     @property
     def mixed(self):
-        """Whether some pieces need more fields than the points are to have."""
+        """Whether some pieces need more fields than the points will have."""
         return bool(self.coefficients[:, 2 * self.fields :].any())
 
     @classmethod
@@ -90,7 +90,7 @@ class PiecewiseMotion(Motion):
         return out if t.ndim else out[0]
 
     def _piece(self, order, piece, x):
-        """Derivative of an order of pieces (k,) at x (k,) from their first knots [s], (k, n)."""
+        """Derivative, of an `order`, of pieces (k,) at x (k,) from their first knots [s], (k, n)."""
         c, x = self._derived[order][piece], x[:, None]
         out = c[:, -1].copy()
         for i in reversed(range(ORDER - 1)):
@@ -99,7 +99,7 @@ class PiecewiseMotion(Motion):
         return out
 
     def since(self, time):
-        """Return the motion without the pieces that have ended by a time [s]; one is always left."""
+        """Return the motion without the pieces that have ended by a time [s]; at least one is left."""
         first = min(int(np.searchsorted(self.knots[1:], time, side="right")), len(self.knots) - 2)
         return PiecewiseMotion(self.knots[first:], self.coefficients[first:], self.fields, self.end)
 
@@ -108,7 +108,7 @@ class PiecewiseMotion(Motion):
         count = int(np.searchsorted(self.knots, time, side="left"))
         knots = np.append(self.knots[:count], time)
         coefficients = self.coefficients[: count if count < len(self.knots) else None]
-        if count == len(self.knots):  # it has ended before: it holds
+        if count == len(self.knots):  # it has ended before, and holds
             hold = np.zeros((1, *coefficients.shape[1:]))
             hold[0, 0] = self.end
             coefficients = np.concatenate([coefficients, hold])

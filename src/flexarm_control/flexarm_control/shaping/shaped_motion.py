@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""A motion convolved with a shaper, exactly, also where the frequencies change along it.
+r"""Convolves a motion with a shaper exactly, also if the frequencies change along the motion.
 
-With constant frequencies the shaped motion is :math:`\sum_i A_i r(t - t_i)`: on every interval between the delayed
-knots a polynomial of the same degree, so that points at these knots give exactly this motion in any controller that
+With constant frequencies the shaped motion is :math:`\sum_i A_i r(t - t_i)`. On every interval between the delayed
+knots it is a polynomial of the same degree. So points at these knots give exactly this motion in any controller that
 joins points as a joint_trajectory_controller does.
 
-Where a frequency f changes slowly, the mode is one of constant frequency in its own phase
+If a frequency f changes slowly, the mode has a constant frequency in its own phase
 :math:`\theta(t) = \int f\,dt` (the first order of the method of Wentzel, Kramers and Brillouin). The impulses are then
 at constant phases :math:`\varphi_i`, and
 
@@ -13,30 +13,30 @@ at constant phases :math:`\varphi_i`, and
     \dot\tau_i = \frac{f(t)}{f(\tau_i)}, \qquad
     \ddot\tau_i = \frac{\dot f(t) - \dot\tau_i^2 \dot f(\tau_i)}{f(\tau_i)}.
 
-A motion r that leaves no vibration by itself (see `time_law`) and is changed to w on the way, by a stop, say, is
-:math:`r + S(w - r)`: only the change is shaped, and nothing steps. Where it is not changed, it stays as it is.
+A motion r that leaves no vibration by itself (see `time_law`) may be changed to w on the way, by a stop, say. It then
+becomes :math:`r + S(w - r)`: only the change is shaped, and nothing jumps. Where it is not changed, it stays as it is.
 
-For several modes this is done one after the other. All A_i are at least 0 and add up to 1: every position lies between
+Several modes are shaped one after the other. All A_i are at least 0 and add up to 1. So every position lies between
 the motion's own, start and end are its own, and with constant frequencies speed and acceleration are never larger. The
-frequency at a time is that at the shaped position of that time, so what is shaped already never depends on what is
-commanded later. The less a frequency changes within a period, the less is left.
+frequency at a time is that at the shaped position of that time. So the part that is shaped already never depends on
+later commands. The less a frequency changes within a period, the less vibration is left.
 """
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-#: Places per period of the lowest mode at which changing frequencies are looked at, and a motion is written then.
+#: Number of places per period of the lowest mode at which changing frequencies are evaluated, and a motion is written.
 PER_PERIOD = 32
-#: Knots closer to each other than this are one [s].
+#: Knots closer to each other than this count as one [s].
 SAME = 2e-6
-#: Newton steps of the time that belongs to a phase.
+#: Number of Newton steps for the time that belongs to a phase.
 STEPS = 3
-#: The frequencies are those along the shaped motion, found from the motion delayed, then in so many steps.
+#: Number of iterations for the frequencies along the shaped motion; they begin with the delayed motion.
 ITERATIONS = 3
 
 
 class Warp:
-    """The phase of a mode whose frequency changes, and the delays that have a constant phase.
+    """The phase of a mode whose frequency changes, and delays by a constant phase.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class Warp:
 
 
 class Constant:
-    """As `Warp`, of a constant `frequency` [Hz]."""
+    """As `Warp`, for a constant `frequency` [Hz]."""
 
     def __init__(self, frequency):
         self._frequency = frequency
@@ -107,9 +107,9 @@ class ShapedMotion:
     ----------
     motion : PiecewiseMotion
     modes : Modes
-        Whose frequencies are constant where there is a `quiet` motion.
+        Their frequencies are constant if there is a `quiet` motion.
     quiet : PiecewiseMotion, optional
-        Which leaves no vibration, and which `motion` departs from.
+        Motion that leaves no vibration, and from which `motion` departs.
     """
 
     def __init__(self, motion, modes, quiet=None):
@@ -125,7 +125,7 @@ class ShapedMotion:
                     (s.cycles, s.amplitudes, Warp(times, found[:, s.mode])) for s in modes.stages
                 ]
                 where = self.states(times)[0]
-        elif modes.stages and quiet is not motion:  # as one, since delays add up
+        elif modes.stages and quiet is not motion:  # as one stage, since delays add up
             train = modes.constant()
             self._stages = [(train.times, train.amplitudes, Constant(1.0))]
         else:

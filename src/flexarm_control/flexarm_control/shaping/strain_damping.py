@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Damping of a mode by a sensor, for arms that take positions: a small correction of the position command.
+r"""Damps a mode by a sensor, for arms that take positions, with a small correction of the position command.
 
-With a joint that follows its command q, a strain :math:`\eta` that sees one mode obeys
+If a joint follows its command q, a strain :math:`\eta` that shows one mode obeys
 
 .. math:: \ddot\eta + 2\zeta\omega\dot\eta + \omega^2\eta = -c\,\ddot q.
 
-A joint velocity in proportion to the strain therefore damps the mode; as a position that is the integral of the strain.
-Delay and drive turn the phase. Near the mode all of it, delay, drive and c, is one complex number :math:`\beta`: to a
-correction u, the complex amplitude z of the mode answers by
+A joint velocity in proportion to the strain therefore damps the mode; as a position, this is the integral of the
+strain. Delay and drive shift the phase. Near the mode's frequency, delay, drive and c together are one complex number
+:math:`\beta`. The complex amplitude z of the mode responds to a correction u by
 
 .. math:: \dot z = p z + \beta u, \qquad y = \operatorname{Re} z + b, \qquad p = -\zeta\omega + i\omega\sqrt{1-\zeta^2},
 
@@ -16,22 +16,22 @@ where y is the reading and b its bias. `identified` finds :math:`\beta` from a s
 .. math:: u = -\kappa \operatorname{Re}\frac{\bar\beta z}{|\beta|}, \qquad
           \kappa = \frac{2 (\zeta_w - \zeta)\,\omega}{|\beta|},
 
-the averaged mode has the damping ratio :math:`\zeta_w` that is wanted: :math:`\dot z \approx (p - \kappa|\beta|/2) z`,
-the method of averaging (Sanders, Verhulst & Murdock 2007, chapter 2). z and b come from an observer with that model,
+the averaged mode has the desired damping ratio :math:`\zeta_w`: :math:`\dot z \approx (p - \kappa|\beta|/2) z`, by the
+method of averaging (Sanders, Verhulst & Murdock 2007, chapter 2). z and b come from an observer with that model,
 
 .. math:: \dot{\hat z} = p\hat z + \beta u + 2\mu\omega r, \qquad \dot{\hat b} = 2\nu\mu\omega r, \qquad
           r = y - \operatorname{Re}\hat z - \hat b.
 
-It is narrow, so that other modes and the noise hardly pass. Where the loop of this model would be unstable with a
-frequency that is off by `MARGIN`, the constructor refuses it.
+The observer is narrow-band, so that other modes and the noise hardly pass. If the loop of this model would be unstable
+with a frequency that is off by `MARGIN`, the constructor refuses it.
 
-An accelerometer is a reading, too, of another phase. That it also moves with the joint is left out: this part is mostly
-in phase with the correction, and changes the frequency a little, not the damping.
+An accelerometer can be the sensor, too, with another phase. Its own motion with the joint is neglected: this part is
+mostly in phase with the correction, and changes the frequency a little, not the damping.
 
-A velocity command gets the correction's rate, whose integral it is.
+A velocity command receives the correction's rate, whose integral is the correction.
 
-The bounds keep the correction a sine: clipped it would come late. A sensor that sticks is taken for bias: the
-correction dies out.
+The bounds keep the correction a sine, because a clipped one would come late. The constant reading of a stuck sensor
+becomes bias, and the correction dies out.
 """
 
 import cmath
@@ -47,17 +47,17 @@ PARAMETERS = (
         "Natural frequency of the mode that is damped, measured with the drives on."
     ),
     parameter("damping", 0.005, "-", 0.0, 0.3, read_only=True).described(
-        "Its damping ratio without correction."
+        "Damping ratio of this mode without correction."
     ),
     parameter("sensitivity", 1.0, "1/(rad s)", 1e-12, 1e12, read_only=True).described(
         "Growth of the reading's amplitude by a correction of one radian, identified by a burst."
     ),
     parameter("phase", 1.5, "rad", -3.2, 3.2, read_only=True).described(
-        "Phase of that answer, identified with it; pi/2 either way without any lag."
+        "Phase of that response, identified with it; pi/2 of either sign without any lag."
     ),
-    parameter("target", 0.2, "-", 0.01, 0.5, read_only=True).described("Damping ratio wanted."),
+    parameter("target", 0.2, "-", 0.01, 0.5, read_only=True).described("Desired damping ratio."),
     parameter("observer", 0.5, "-", 0.02, 2.0, read_only=True).described(
-        "Rate at which the observer follows the reading, over the mode's angular frequency."
+        "Rate at which the observer follows the reading, relative to the mode's angular frequency."
     ),
     parameter("max_correction", 0.02, "rad", 1e-9, 3.0, read_only=True).described(
         "Largest correction of the position."
@@ -69,29 +69,30 @@ PARAMETERS = (
         "A reading beyond this is in doubt."
     ),
     parameter("timeout", 0.05, "s", 0.001, 10.0, read_only=True).described(
-        "A sensor that is silent or in doubt for longer fades the correction out."
+        "If the sensor is silent or in doubt for longer, the correction fades out."
     ),
     parameter("fade", 0.2, "s", 0.001, 10.0, read_only=True).described(
         "Time in which the correction goes from full to zero, and back."
     ),
     parameter("rejoin", 1.0, "s", 0.0, 60.0, read_only=True).described(
-        "A sensor must be good for so long until the correction comes back."
+        "The sensor must be good for this long before the correction comes back."
     ),
     parameter("max_saturated", 2.0, "s", 0.1, 3600.0, read_only=True).described(
-        "At its bounds for so long while the mode swings no less, the correction is off until the next start."
+        "If the correction is at its bounds for this long while the mode swings no less, it is off until the next"
+        " start."
     ),
 )
 #: The loop must be stable with a frequency off by this fraction.
 MARGIN = 0.15
-#: Rate of the bias over that of the observer [-].
+#: Ratio of the rate of the bias to that of the observer [-].
 DRIFT = 0.1
-#: A reading counts for at most so many periods: longer steps would overshoot.
+#: A reading counts for at most this many periods, since longer steps would overshoot.
 LATE = 2.0
-#: After `max_saturated` at the bounds the mode must swing less than this fraction of the largest swing since [-].
+#: After `max_saturated` at the bounds, the mode must swing less than this fraction of the largest swing since [-].
 LESS = 0.9
-#: A burst has so many periods; after its end the drive gets this fraction of a period to settle.
+#: Number of periods of a burst; after its end the drive has this fraction of a period to settle.
 BURST_PERIODS, SETTLE = 2.0, 0.25
-#: Ringing after the burst must be recorded for so many periods.
+#: Number of periods for which ringing must be recorded after the burst.
 RINGING_PERIODS = 1.0
 ACTIVE, FADING, OFF = "active", "fading", "off"
 
@@ -103,12 +104,12 @@ def pole(frequency, damping):
 
 
 def moved(z, p, beta, u, time):
-    """The mode's amplitude after a time in which the correction stands still, exactly.
+    """The mode's exact amplitude after a time with constant correction.
 
     Parameters
     ----------
     z, p, beta : complex
-        Amplitude, pole [rad/s], answer [1/(rad s)].
+        Amplitude, pole [rad/s], response [1/(rad s)].
     u : float
         Correction [rad].
     time : float
@@ -128,7 +129,7 @@ def burst(frequency, amplitude, period):
     amplitude : float
         [rad]
     period : float
-        Of the commands [s].
+        Period of the commands [s].
     """
     t = np.arange(int(BURST_PERIODS / (frequency * period)) + 1) * period
     window = np.sin(np.pi * t * frequency / BURST_PERIODS) ** 2
@@ -137,32 +138,32 @@ def burst(frequency, amplitude, period):
 
 
 def identified(frequency, damping, period, corrections, readings):
-    """Answer of the mode to corrections, from the ringing after they ended.
+    """Identify the mode's response to corrections, from the ringing after they ended.
 
     Parameters
     ----------
     frequency : float
-        Measured [Hz].
+        Measured frequency [Hz].
     damping : float
         Measured ratio [-].
     period : float
-        Of both records [s].
+        Period of both records [s].
     corrections : (k,) array_like
-        That were sent, from rest; they end where they began [rad].
+        Corrections sent from rest; they end where they began [rad].
     readings : (k,) array_like
-        Of the sensor when each was sent.
+        Reading of the sensor when each was sent.
 
     Returns
     -------
     beta : complex
         Its modulus is the `sensitivity`, its angle the `phase`.
     left : float
-        Rms of what the mode does not explain over the rms of the ringing [-].
+        Ratio of the rms that the mode does not explain to the rms of the ringing [-].
 
     Raises
     ------
     DesignError
-        Where there are not as many readings, the corrections do not move, or no period of ringing is recorded.
+        If there are not as many readings, the corrections do not move, or no period of ringing is recorded.
     """
     u, y = np.asarray(corrections, float), np.asarray(readings, float)
     if u.ndim != 1 or u.shape != y.shape:
@@ -193,25 +194,25 @@ class StrainDamping:
     settings : mapping
         Checked values of `PARAMETERS`.
     period : float
-        Of the commands [s].
+        Period of the commands [s].
 
     Attributes
     ----------
     correction : float
-        What is added to the position command now [rad].
+        Value to add to the position command now [rad].
     rate : float
-        What is added to a velocity command in its place, for a period: its integral is the correction [rad/s].
+        Value to add to a velocity command instead, for a period; its integral is the correction [rad/s].
     state : str
         `ACTIVE`; `FADING`, out or in; `OFF`.
     reason : str
-        Why the correction fades out or is off; empty: it is on, or fades in.
+        Why the correction fades out or is off; empty if it is on, or fades in.
     latched : bool
         Whether it stays off until `begin`.
 
     Raises
     ------
     DesignError
-        Where the target is no more than the mode's own damping, or the loop unstable with the frequency off by
+        If the target is no more than the mode's own damping, or the loop is unstable with the frequency off by
         `MARGIN`.
     """
 
@@ -235,7 +236,7 @@ class StrainDamping:
         self.begin()
 
     def begin(self):
-        """Start at rest: the next good reading is the bias."""
+        """Start at rest; the next good reading is the bias."""
         self._z, self._bias, self._weight = 0j, None, 1.0
         self._time = self._stamp = self._read_at = self._good_since = self._good_at = None
         self._saturated_since, self._swing = None, 0.0
@@ -248,12 +249,13 @@ class StrainDamping:
         ================================== ================================================================
         the sensor                         what happens
         ================================== ================================================================
-        silent, NaN, beyond full scale,    the observer goes on without; after `timeout` the correction
-        with a stamp that is not new       fades out, until the sensor was good for `rejoin`
+        silent, NaN, beyond full scale,    the observer goes on without it; after `timeout` the correction
+        with a stamp that is not new       fades out, until the sensor has been good for `rejoin`
         good                               the correction damps, within size and rate
         ================================== ================================================================
 
-        At its bounds for `max_saturated` while the mode swings as before, it fades out and stays off until `begin`.
+        If the correction is at its bounds for `max_saturated` while the mode swings as before, it fades out and stays
+        off until `begin`.
 
         Parameters
         ----------
@@ -262,7 +264,7 @@ class StrainDamping:
         strain : float, optional
             The newest reading; None: there is none.
         stamp : float, optional
-            When it was taken [s]; `now` if not given.
+            Time of that reading [s]; `now` if not given.
         """
         step = self._step_to(now)
         self._z = moved(self._z, self._p, self._beta, self.correction, step)
@@ -279,7 +281,7 @@ class StrainDamping:
         return self.correction
 
     def _step_to(self, now):
-        """Time since the call before [s]; where the clock goes back, times before are forgotten."""
+        """Time since the previous call [s]; if the clock goes back, earlier times are forgotten."""
         last, self._time = self._time, now
         if last is None:
             return 0.0
@@ -289,7 +291,7 @@ class StrainDamping:
         return max(now - last, 0.0)
 
     def _problem(self, now, strain, stamp):
-        """What is wrong with a reading; empty: nothing."""
+        """What is wrong with a reading; empty if nothing is."""
         last = self._stamp
         if strain is None:
             return "the sensor is silent"
@@ -305,7 +307,7 @@ class StrainDamping:
         return ""
 
     def _correct(self, strain, now):
-        """Correct the observer by a reading, as much as is due since the reading before."""
+        """Correct the observer by a reading, in proportion to the time since the previous reading."""
         if self._bias is None:
             self._z, self._bias = 0j, strain
         since = 0.0 if self._read_at is None else now - self._read_at
@@ -316,7 +318,7 @@ class StrainDamping:
         self._bias += DRIFT * part * error
 
     def _judge(self, now, problem):
-        """Decide by how long the sensor has been good or bad whether the correction is wanted."""
+        """Decide whether the correction is wanted, by how long the sensor has been good or bad."""
         if problem:
             self._good_at = now if self._good_at is None else self._good_at
             if now - self._good_at > self.settings["timeout"]:
@@ -337,14 +339,14 @@ class StrainDamping:
             self._z, self._bias = 0j, None
 
     def _bounded(self, amplitude, step):
-        """The correction: a sine within the bounds, moved at most at its rate [rad]."""
+        """The correction: a sine within the bounds, which moves at most at its rate [rad]."""
         scale = min(1.0, self._largest / amplitude) if amplitude else 1.0
         wanted = -self._gain * (self._beta.conjugate() * self._z).real / abs(self._beta)
         way = self.settings["max_rate"] * step
         return min(max(self._weight * scale * wanted, self.correction - way), self.correction + way)
 
     def _note_saturation(self, now, amplitude):
-        """Watch a correction at its bounds, and switch it off for good where the mode swings no less."""
+        """Watch a correction at its bounds, and switch it off for good if the mode swings no less."""
         if self.reason or amplitude <= self._largest:
             self._saturated_since = None
             return
@@ -361,9 +363,9 @@ class StrainDamping:
             self._saturated_since = None
 
     def radius(self, factor=1.0):
-        """Largest modulus of the eigenvalues of the loop by the model, with the mode's frequency times a factor.
+        """Largest modulus of the eigenvalues of the model's loop, with the mode's frequency times a factor.
 
-        The lag, by which the phase is short of pi/2, stays a time: the phase of another frequency is another.
+        The lag, by which the phase is short of pi/2, is a constant time, so another frequency has another phase.
 
         Parameters
         ----------

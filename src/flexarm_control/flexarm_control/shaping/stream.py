@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams of set points, of MoveIt Servo say, shaped sample by sample.
+"""Shapes streams of set points, such as those of MoveIt Servo, sample by sample.
 
-The same shaper as for trajectories (`shaped_motion`), as a filter: each output is the weighted sum of inputs that came
-a constant phase of the mode earlier, joined by lines. Outputs are between the largest and the smallest input.
+The shaper is the same as for trajectories (`shaped_motion`), used as a filter. Each output is the weighted sum of
+inputs a constant phase of the mode earlier, joined by lines. Outputs are between the largest and the smallest input.
 """
 
 from bisect import bisect_right
@@ -23,7 +23,7 @@ class _Filter:
         self._phases, self._values = [0.0], [value]
 
     def step(self, advance, value):
-        """The output for an input (n,) that comes `advance` periods after the one before."""
+        """The output for an input (n,) that comes `advance` periods after the previous one."""
         now = self._phases[-1] + advance
         self._phases.append(now)
         self._values.append(value)
@@ -71,7 +71,7 @@ class StreamShaper:
         Raises
         ------
         MessageError
-            Where there is not one finite number for each joint in `values`.
+            If there is not one finite number for each joint in `values`.
         """
         found = np.array(values, float)
         if found.shape != (len(self._names),):
@@ -105,11 +105,11 @@ class StreamShaper:
         Parameters
         ----------
         value : (n,) ndarray
-            Checked.
+            Checked input.
         period : float
-            Since the input before, above 0 [s].
+            Time since the previous input, above 0 [s].
         configuration : (n,) array_like, optional
-            Joint positions, where the stream has none [rad]. Not given: the last output.
+            Joint positions, if the stream has none [rad]; if not given, the last output.
         """
         if not self.started:
             return self.begin(value)

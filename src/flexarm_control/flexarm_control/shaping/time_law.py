@@ -1,40 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""A new time law for a straight motion from rest to rest, made for the modes along the way: a linear programme.
+r"""Finds a new time law for a straight motion from rest to rest, for the modes along its path, by a linear programme.
 
-Motions of a few periods change the frequencies of an arm while they last. The way of the joints,
+During motions of a few periods, the frequencies of an arm change. The path of the joints,
 :math:`q = q_0 + \Delta\,\sigma(t)`, stays; :math:`\ddot\sigma` becomes piecewise linear between equal times, 0 at both
-ends. Each mode obeys, at the configurations that it passes,
+ends. At the configurations on the path, each mode obeys
 
 .. math:: \ddot x + 2\zeta\omega(\sigma)\dot x + \omega(\sigma)^2 x = -\ddot\sigma, \qquad
     z(T) \approx \int_0^T \ddot\sigma(t)\,\sqrt{\frac{\omega(T)}{\omega(t)}}\;
     e^{\int_t^T(-\zeta\omega + j\omega_d)d\tau}\,dt,
 
 to the first order of the method of Wentzel, Kramers and Brillouin. With :math:`\omega(\sigma(t))` along a known
-:math:`\sigma`, the amplitude z that is left is linear in the accelerations, and
+:math:`\sigma`, the remaining amplitude z is linear in the accelerations, and
 
 .. math:: \min \epsilon \quad\text{with}\quad |z_m(c)| \le \epsilon\, n_m(c),\;
     |\ddot\sigma| \le a,\; 0 \le \dot\sigma \le v,\; \dot\sigma(T) = 0,\; \sigma(T) = 1
 
 is a linear programme over all modes m and factors c of their frequencies within the spread; v and a are the given
-motion's own. n is what the given motion leaves, at least `FLOOR` of its largest, and :math:`\epsilon` at the measured
-frequencies is `robust_shapers.AT_DESIGN` times as large at most. The programme is solved `ROUNDS` times, each along the
-solution before. Every motion that a shaper can make of a straight one is such a time law, too, but for the rounding of
-the accelerations, so that no less is left by a shaper.
+motion's own. n is the amplitude that the given motion leaves, at least `FLOOR` of its largest. At the measured
+frequencies :math:`\epsilon` is at most `robust_shapers.AT_DESIGN` times as large. The programme is solved `ROUNDS`
+times, each time along the previous solution. Every motion that a shaper can make of a straight one is such a time law,
+too, except for the rounding of the accelerations. So no shaper leaves less.
 
-Modes that come close on the way change their shapes, and hand energy to each other. How much, frequencies alone do not
-tell; its form is, for what mode k hands to mode m,
+Modes that come close on the way change their shapes, and pass energy to each other. Frequencies alone do not give the
+amount. For what mode k passes to mode m, its form is
 
 .. math:: C_{mk} = \int_0^T \dot\sigma(t)\, z_k(t)\, e^{\int_t^T(-\zeta_m\omega_m + j\omega_{d,m})d\tau}\,dt,
 
 the first correction, times an unknown number of order 1. It is linear in the accelerations, too, with
-:math:`\dot\sigma` of the solution before; :math:`|C_{mk}| \le \epsilon\,n_m` / `COUPLED` keeps it small.
+:math:`\dot\sigma` of the previous solution; :math:`|C_{mk}| \le \epsilon\,n_m` / `COUPLED` keeps it small.
 
-A drive at its torque limit does not do what it is commanded. The `robust` shaper of the same modes spreads the
-accelerations out; a new time law has no larger ones than that, where there is one. One that would leave more than the
-given motion, at any frequency within the spread, is not used.
+A drive at its torque limit does not follow its command. The `robust` shaper of the same modes spreads the
+accelerations out. A new time law has no larger accelerations than that, if there is such a law. One that would leave
+more vibration than the given motion, at any frequency within the spread, is not used.
 
-Time laws of piecewise linear acceleration that are least exciting, for one constant mode, are an old use of linear
-programming (Singh 2010, *Optimal Reference Shaping for Dynamical Systems*, chapter 5).
+Least exciting time laws of piecewise linear acceleration, for one constant mode, are an old use of linear programming
+(Singh 2010, *Optimal Reference Shaping for Dynamical Systems*, chapter 5).
 """
 
 import numpy as np
@@ -44,34 +44,34 @@ from ..motions.robust_shapers import AT_DESIGN
 from .piecewise import PiecewiseMotion
 from .shaped_motion import ShapedMotion
 
-#: Pieces of the acceleration per period of the lowest mode, at least so many in all, and at most. More of them leave
-#: less of the modes that are measured, and excite more of those that are not.
+#: Number of pieces of the acceleration per period of the lowest mode, and minimum and maximum of their total. More
+#: pieces leave less vibration of the measured modes, and excite the others more.
 PER_PERIOD, FEWEST, MOST = 7, 12, 80
-#: Places in each piece at which the modes are looked at, and in the given motion.
+#: Number of places at which the modes are evaluated, in each piece and in the given motion.
 FINE, PLACES = 6, 400
-#: Factors of the frequencies within the spread, and directions around the circle.
+#: Number of factors of the frequencies within the spread, and of directions around the circle.
 FACTORS, DIRECTIONS = 9, 16
-#: The given motion may leave next to nothing by chance: it counts for this fraction of its largest at least [-].
+#: The given motion may leave almost nothing by chance; it counts as leaving at least this fraction of its largest [-].
 FLOOR = 0.3
-#: What one mode hands to another counts so many times; at how many factors of the frequencies it is looked at.
+#: Weight of what one mode passes to another, and number of factors of the frequencies at which it is evaluated.
 COUPLED, COUPLED_FACTORS = 10.0, 3
-#: Solutions, each along the one before.
+#: Number of solutions, each along the previous one.
 ROUNDS = 3
 #: A motion is straight if it stays this close to its line, over its length [-].
 STRAIGHT = 1e-4
-#: A stop is given so many times what the largest acceleration needs, and `modes.periods`; longer by so much if needed.
+#: Time for a stop over what the largest acceleration needs, beside `modes.periods`; factor if it must be longer.
 STOP, LONGER = 1.3, 1.3
-#: Within the limits a stop may accelerate so many times as much as the motion does [-].
+#: Within the limits, a stop may accelerate this many times as much as the motion does [-].
 HARDER = 1.3
 #: Rounding of the speeds [-].
 SLACK = 1e-9
-#: A linear programme is given up after so many iterations, some 100 are usual: a count, so that a busy computer finds
-#: the same motion.
+#: A linear programme is given up after this many iterations; some 100 are usual. This is a count, so that a busy
+#: computer finds the same motion.
 ITERATIONS = 10_000
 
 
 def along(motion):
-    """Progress of a motion on its line at times (k,), its first two derivatives too; None where it is not straight.
+    """Progress of a motion on its line at times (k,), with its first two derivatives; None if it is not straight.
 
     Parameters
     ----------
@@ -114,26 +114,26 @@ def retimed(motion, modes, velocity=np.inf, acceleration=np.inf):
     motion : PiecewiseMotion
     modes : Modes
     velocity, acceleration : (n,) array_like
-        Limits [rad/s], [rad/s^2]; the motion's own largest hold in any case.
+        Limits [rad/s], [rad/s^2]; the motion's own largest values are limits in any case.
 
     Returns
     -------
     PiecewiseMotion or None
-        None where the motion is not straight, or there is no such time law within the limits.
+        None if the motion is not straight, or there is no such time law within the limits.
     """
     found = solved(motion, modes, velocity, acceleration)
     return None if found is None else found[0].motion(found[2])
 
 
 def solved(motion, modes, velocity=np.inf, acceleration=np.inf, plain=False):
-    """What `retimed` finds: the programme, what the given motion leaves (as of `Line.norms`), and the accelerations.
+    """Result of `retimed`: the programme, what the given motion leaves (as in `Line.norms`), and the accelerations.
 
     Parameters
     ----------
     motion, modes, velocity, acceleration
-        As of `retimed`.
+        As for `retimed`.
     plain : bool
-        By the modes alone: whatever they hand to each other, with accelerations up to the limits.
+        Consider the modes alone, whatever they pass to each other, with accelerations up to the limits.
 
     Returns
     -------
@@ -161,7 +161,7 @@ def solved(motion, modes, velocity=np.inf, acceleration=np.inf, plain=False):
 
 
 def _of_progress(motion, limits):
-    """Limits of the joints (n,) as one of the progress."""
+    """Limits of the joints (n,) as one limit of the progress."""
     return float((np.asarray(limits) / np.maximum(np.abs(motion.angle), 1e-300)).min())
 
 
@@ -174,12 +174,12 @@ def _gentle(motion, modes):
 
 
 def leaves(motion, modes):
-    """What a straight motion leaves of each mode, at factors of the frequencies over the spread.
+    """Amplitudes that a straight motion leaves of each mode, at factors of the frequencies over the spread.
 
     Parameters
     ----------
     motion : PiecewiseMotion
-        On a straight line, as of `along` or `retimed`.
+        On a straight line, as in `along` or from `retimed`.
     modes : Modes
 
     Returns
@@ -191,7 +191,7 @@ def leaves(motion, modes):
 
 
 def stopped(motion, modes, time, acceleration=np.inf):
-    """A motion of `retimed` up to a time, then to rest on its line: the stop takes out what was excited before.
+    """A motion of `retimed` up to a time, then to rest on its line; the stop removes the vibration excited before.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def stopped(motion, modes, time, acceleration=np.inf):
     Returns
     -------
     PiecewiseMotion
-        The motion itself where it ends as early.
+        The motion itself if it ends as early.
     """
     progress = along(motion)
     if progress is None or time >= motion.knots[-1]:
@@ -257,16 +257,16 @@ class Line:
         return self.progress(0, middles), steps, self.progress(2, middles)
 
     def norms(self):
-        """What the motion leaves of each mode, at least `FLOOR` of its largest, list of (factors,)."""
+        """Amplitudes that the motion leaves of each mode, at least `FLOOR` of the largest, list of (factors,)."""
         return [np.maximum(values, FLOOR * values.max()) for values in self.remains()]
 
     def remains(self):
-        """What the motion leaves of each mode, list of (factors,)."""
+        """Amplitudes that the motion leaves of each mode, list of (factors,)."""
         progress, steps, bend = self.history(self.motion.knots[-1])
         return [np.abs(values[:, 0]) for values in self.left(progress, steps, bend[:, None])]
 
     def left(self, progress, steps, parts):
-        """What accelerations (k, p) in cells of durations `steps` leave of each mode, list of (factors, p) complex."""
+        """Amplitudes that accelerations (k, p) in cells of durations `steps` leave, list of (factors, p) by mode."""
         sizes, turns = self._turning(progress, steps)
         found = []
         for size, turn in zip(sizes.T, turns.T, strict=True):
@@ -276,7 +276,7 @@ class Line:
         return found
 
     def coupled(self, progress, steps, parts):
-        """What the other modes hand to each mode, as of `left`: list of (others and factors, p) complex."""
+        """What the other modes pass to each mode, as for `left`: list of (others and factors, p) complex."""
         sizes, turns = self._turning(progress, steps)
         after, way = np.cumsum(turns, axis=0), np.gradient(progress)[:, None]
         phases, count = after - 0.5 * turns, self.modes_count
@@ -296,7 +296,7 @@ class Line:
         return np.linspace(1.0 - self._modes.spread, 1.0 + self._modes.spread, count)
 
     def _turning(self, progress, steps):
-        """In each cell of each mode, (k, m): what an acceleration of 1 counts at the end [s], and the turn, complex."""
+        """For each cell and mode, (k, m): the effect at the end of an acceleration of 1 [s], and the complex turn."""
         frequencies, dampings = self.at(progress)
         w = 2.0 * np.pi * frequencies
         turns = w * (-dampings + 1j * np.sqrt(1.0 - dampings**2)) * steps[:, None]
@@ -312,11 +312,12 @@ class Law:
     duration : float
         [s]
     limits : sequence of 2 floats
-        Of speed and acceleration of the progress [1/s], [1/s^2].
+        Limits of speed and acceleration of the progress [1/s], [1/s^2].
     state : sequence of 3 floats, optional
-        Progress, speed and acceleration at which a stop begins; not given: a motion from rest to the end of the line.
+        Progress, speed and acceleration at which a stop begins; if not given, the motion is from rest to the end of the
+        line.
     time : float, optional
-        When the stop begins [s].
+        Time at which the stop begins [s].
     """
 
     def __init__(self, line, duration, limits, state=None, time=None):
@@ -329,7 +330,7 @@ class Law:
         cells = self.count * FINE
         self.middles = duration * (np.arange(cells) + 0.5) / cells
         hats = np.array([np.interp(self.middles, self.nodes, h) for h in np.eye(self.count + 1)]).T
-        # Of the acceleration at the start, then of the inner ones; what was before stands in the first column.
+        # Columns: the acceleration at the start, then the inner ones; the first column has the past, too.
         self._parts = np.zeros((self._past[0].size + cells, self.count))
         self._parts[: self._past[0].size, 0] = self._past[2]
         self._parts[self._past[0].size :] = hats[:, :-1] * np.append(
@@ -355,7 +356,7 @@ class Law:
         return states
 
     def motion(self, x):
-        """The motion from rest to rest by accelerations x, slowed down where its speed is too high between nodes."""
+        """The motion from rest to rest by accelerations x, slowed down if its speed is too high between nodes."""
         given = self._line.motion
         # Between two nodes the speed is a parabola, whose top may be above both.
         slower = max(self.top(x) / self.limits[0], 1.0)
@@ -364,7 +365,7 @@ class Law:
         return PiecewiseMotion.through(given.knots[0] + slower * self.nodes, made[: given.fields])
 
     def left(self, x, line):
-        """What each acceleration of x leaves of each mode of a `line`, along the motion by x, (m, N - 1) complex."""
+        """Amplitude that each acceleration of x leaves of each mode of a `line`, on the motion by x, (m, N - 1)."""
         found = line.left(self._middle_progress(x), self._steps, self._parts)
         return np.array([values[FACTORS // 2, 1:] for values in found])
 
@@ -377,7 +378,7 @@ class Law:
         return np.concatenate([[self._state[2]], x, [0.0]])
 
     def top(self, x):
-        """Largest speed of the progress, between nodes, too."""
+        """Largest speed of the progress, also between nodes."""
         bend = self._all(x)
         speed = self._state[1] + self._speed @ bend
         before, after = bend[:-1], bend[1:]
@@ -386,18 +387,18 @@ class Law:
         return float(np.maximum(speed[:-1] + rise, speed[1:]).max())
 
     def solution(self, norms, sigma, acceleration=np.inf, coupled=True):
-        """The accelerations x that leave least; None: there are none within the limits.
+        """The accelerations x that leave least; None if there are none within the limits.
 
         Parameters
         ----------
         norms : list of (factors,) ndarrays
-            In which what is left of each mode counts.
+            Units in which the remaining amplitude of each mode counts.
         sigma : (k,) ndarray
             Progress to begin with, at the middles.
         acceleration : float
-            A limit of its own, beside `limits` [1/s^2].
+            A further limit beside `limits` [1/s^2].
         coupled : bool
-            Whether to keep small what modes hand to each other.
+            Whether to keep small what modes pass to each other.
         """
         x, acceleration = None, min(acceleration, self.limits[1])
         for _ in range(ROUNDS):
@@ -410,14 +411,14 @@ class Law:
         return x
 
     def worst(self, x, norms):
-        """The largest part of `norms` that accelerations x leave, over all modes and factors of their frequencies."""
+        """The largest fraction of `norms` that accelerations x leave, over all modes and factors of frequencies."""
         along = np.append(self._past[0], self._middle_progress(x)), self._steps, self._parts
         made = np.append(1.0, x)
         left = (np.abs(values @ made) for values in self._line.left(*along))
         return float(max((v / norm).max() for v, norm in zip(left, norms, strict=True)))
 
     def _programme(self, left, coupled, norms, acceleration):
-        """Solve one linear programme; its x, None where the limits contradict each other."""
+        """Solve one linear programme; returns its x, or None if the limits contradict each other."""
         around = np.exp(-2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)
         parts = [v / norm[:, None] for v, norm in zip(left, norms, strict=True)]
         handed = [COUPLED / np.median(n) * v for v, n in zip(coupled, norms, strict=False)]
@@ -456,7 +457,7 @@ class Law:
 
 
 def _integrals(count, step):
-    """Progress and speed at the nodes by the accelerations there, two (N + 1, N + 1) matrices."""
+    """Matrices of progress and speed at the nodes from the accelerations there, two (N + 1, N + 1)."""
     speed, way = (np.zeros((count + 1, count + 1)) for _ in range(2))
     for k in range(count):
         speed[k + 1], way[k + 1] = speed[k], way[k] + step * speed[k]

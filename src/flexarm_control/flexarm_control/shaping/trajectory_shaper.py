@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Trajectories in, shaped trajectories out: what the node `shaper` does, without ROS.
+r"""Shapes trajectories: what the node `shaper` does, without ROS.
 
-The unshaped motion is kept as long as it still acts: a trajectory that replaces another one takes over from its own
+The unshaped motion is kept as long as it still acts. A trajectory that replaces another one takes over from its own
 start, and the whole is shaped, so that no vibration is left of either. The same holds for a stop: the unshaped
 motion's own time slows down (see `trajectory.path.Slowing`), at most as hard as the limits of acceleration allow, and
-the result is shaped. A motion with a new time law (`time_law`) needs no shaper; it stops by another time law, and of a
-trajectory that replaces it, the change is shaped.
+the result is shaped. A motion with a new time law (`time_law`) needs no shaper. It stops by another time law; if a
+trajectory replaces it, only the change is shaped.
 """
 
 import copy
@@ -26,20 +26,20 @@ from .shaped_motion import ShapedMotion
 
 PARAMETERS = (
     parameter("velocity", [0.0], "rad/s", 0.0, 1e4, length="joints", read_only=True).described(
-        "Largest speeds of the shaped motion, which is slowed down where they would be exceeded; 0: not limited."
+        "Largest speeds of the shaped motion, which is slowed down if it would exceed them; 0: not limited."
     ),
     parameter(
         "acceleration", [0.0], "rad/s^2", 0.0, 1e6, length="joints", read_only=True
     ).described(
-        "Largest accelerations, likewise; 0: not limited. Trajectories must then give velocities."
+        "Largest accelerations, likewise; 0: not limited. With a limit, trajectories must give velocities."
     ),
     parameter("jerk", [0.0], "rad/s^3", 0.0, 1e9, length="joints", read_only=True).described(
-        "Largest jerks, of the time law jerk_limited."
+        "Largest jerks, for the time law jerk_limited."
     ),
 )
 #: Time laws of the unshaped motion: that of its points, the quickest of `limited`.
 GIVEN, JERK_LIMITED, TIME_OPTIMAL = TIME_LAWS = "given", "jerk_limited", "time_optimal"
-#: What each needs of the limits, and the library that makes it.
+#: Limits that each needs, and the library that computes it.
 NEEDS = {
     JERK_LIMITED: (("velocity", "acceleration", "jerk"), "ruckig"),
     TIME_OPTIMAL: (("velocity", "acceleration"), "toppra"),
@@ -50,22 +50,22 @@ BESIDE = 1e-3
 MAX_POINTS = 20_000
 #: How far a first point at time 0 may be from where the joints are [rad].
 START_TOLERANCE = 0.05
-#: Attempts to slow a motion down into its limits, and by how much more than needed: twice as much each time, up to the
-#: most. What is shaped with a slow mode comes near its limit by a thousandth at a time.
+#: Number of attempts to slow a motion down into its limits, and by how much more than needed: twice as much each time,
+#: up to the last value. A motion shaped with a slow mode comes near its limit by a thousandth at a time.
 ATTEMPTS, MARGIN, MOST = 60, 1e-9, 1e-3
-#: Places in each piece at which its speed and acceleration are looked at, as fractions of its length.
+#: Places in each piece at which its speed and acceleration are evaluated, as fractions of its length.
 PLACES = np.linspace(0.0, 1.0 - 1e-6, 9)
-#: Points of a stop, its shortest duration [s], and the ratio of the durations that are tried.
+#: Number of points of a stop, its shortest duration [s], and the ratio of the durations that are tried.
 STOP_POINTS, MIN_STOP, LONGER = 24, 0.05, 1.15
-#: Without limits: acceleration of a stop over the motion's own, and at least so much for each rad/s of speed [1/s].
+#: Without limits: acceleration of a stop over the motion's own, and its minimum for each rad/s of speed [1/s].
 STOP_ACCELERATION, STOP_RATE = 1.3, 4.0
-#: A motion that is under way is handed over with its first point so much later [s].
+#: When a motion is handed over under way, its first point comes this much later [s].
 HANDOVER = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Shaped:
-    """A shaped trajectory, to be sent on.
+    """A shaped trajectory to send on.
 
     Attributes
     ----------
@@ -74,15 +74,15 @@ class Shaped:
     fresh : bool
         Whether nothing moves before `start_ns`; else it goes on from where the motion is then.
     times_ns : (k,) int64 ndarray
-        Of the points [ns].
+        Times of the points [ns].
     fields : list of (k, n) ndarrays
         Positions, then velocities and accelerations, as many as the unshaped trajectory has.
     end_ns : int
-        When the shaped motion ends [ns].
+        Time at which the shaped motion ends [ns].
     added : float
-        How much later it ends than the trajectory that was given [s].
+        How much later it ends than the given trajectory [s].
     stretch : float
-        By which factor it was slowed down for its limits [-].
+        Factor by which it was slowed down for its limits [-].
     """
 
     start_ns: int
@@ -96,17 +96,17 @@ class Shaped:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A shaped trajectory that has been made and not yet been taken.
+    """A shaped trajectory that is ready and not yet taken.
 
     Attributes
     ----------
     motion, quiet : PiecewiseMotion
-        The unshaped motion, and the one that leaves no vibration, where there is one.
+        The unshaped motion, and the one that leaves no vibration, if there is one.
     shaped : ShapedMotion
     epoch_ns : int
         Time from which their times count [ns].
     result : Shaped
-        What is to be sent on.
+        Trajectory to send on.
     """
 
     motion: PiecewiseMotion
@@ -132,9 +132,9 @@ class TrajectoryShaper:
     Raises
     ------
     ParameterError
-        Where the time law needs a limit that is not given.
+        If the time law needs a limit that is not given.
     DesignError
-        Where its library is not installed.
+        If its library is not installed.
     """
 
     def __init__(self, modes: Modes, joint_names, limits, time_law=GIVEN):
@@ -151,11 +151,11 @@ class TrajectoryShaper:
 
     @property
     def takes_long(self):
-        """Whether a trajectory or a stop may take seconds to be made: better in a thread, of a `snapshot`."""
+        """Whether a trajectory or a stop may take seconds to compute; then better in a thread, with a `snapshot`."""
         return self.modes.kind == RETIMED or self._law == TIME_OPTIMAL
 
     def snapshot(self):
-        """This shaper as it is now: what is taken here later does not change it."""
+        """A copy of this shaper as it is now; plans that are taken here later do not change it."""
         return copy.copy(self)
 
     # Where it is -----------------------------------------------------------------------------
@@ -174,7 +174,7 @@ class TrajectoryShaper:
         return self._shaped.states(np.array([self._seconds(now_ns)]))[:, 0]
 
     def forget(self):
-        """The joints were moved by others: the next trajectory begins where it is measured."""
+        """Forget the motion, since others moved the joints; the next trajectory begins at the measured positions."""
         self._motion = self._shaped = self._quiet = None
 
     # Trajectories ----------------------------------------------------------------------------
@@ -185,19 +185,19 @@ class TrajectoryShaper:
         Parameters
         ----------
         trajectory, now_ns, measured
-            As of `prepared`.
+            As for `prepared`.
         """
         return self.take(self.prepared(trajectory, now_ns, measured))
 
     def take(self, plan, now_ns=0) -> Shaped:
-        """From now on move as planned.
+        """Move as planned from now on.
 
         Parameters
         ----------
         plan : Plan
-            Of this shaper, and of the motion that is under way.
+            A plan of this shaper for the motion that is under way.
         now_ns : int
-            A fresh motion that was to begin before this begins then [ns].
+            A fresh motion that was to begin before this time begins at this time [ns].
         """
         result = plan.result
         late = max(now_ns - result.start_ns, 0) if result.fresh else 0
@@ -216,18 +216,18 @@ class TrajectoryShaper:
         Parameters
         ----------
         trajectory : JointTrajectoryData
-            Checked.
+            Checked trajectory.
         now_ns : int
             [ns]
         measured : (n,) array_like, optional
             Where the joints are [rad].
         quick : bool
-            Without a new time law: shaped, which takes milliseconds.
+            Shape without a new time law, which takes milliseconds.
 
         Raises
         ------
         TrajectoryError
-            Where it has no beginning, can't be kept within the limits, or gets too many points; nothing changes then.
+            If it has no beginning, can't be kept within the limits, or gets too many points; then nothing changes.
         """
         start_ns = max(trajectory.stamp_ns, now_ns) if trajectory.stamp_ns else now_ns
         moving = self.moving(now_ns)
@@ -261,7 +261,7 @@ class TrajectoryShaper:
         return self._planned(motion, quiet, epoch_ns, begin, last, stretch, fresh)
 
     def _replaced(self, start, quick):
-        """The motion that leaves no vibration, where another one takes over at `start` [s]; None: there is none."""
+        """The motion that leaves no vibration if another one takes over at `start` [s]; None if there is none."""
         if quick or self._quiet is None or self._quiet is not self._motion:
             return self._quiet
         return time_laws.stopped(self._quiet, self.modes, start, self._acceleration)
@@ -338,7 +338,7 @@ class TrajectoryShaper:
             )
 
     def _rest(self, measured):
-        """Where the joints stand (n,): where the last motion has ended, unless they were moved since."""
+        """Where the joints rest (n,): the end of the last motion, unless they were moved since."""
         if self._motion is None:
             return measured
         end = self._motion.end
@@ -346,7 +346,7 @@ class TrajectoryShaper:
         return measured if moved else end
 
     def _within_limits(self, before, quiet, begin, start, times, fields):
-        """The unshaped motion, slowed down where the shaped one would exceed its limits; and by which factor."""
+        """The unshaped motion, slowed down if the shaped one would exceed its limits, and the factor."""
         if np.isfinite(self._acceleration).any() and len(fields) == 1:
             raise TrajectoryError(
                 "are not given: speeds step, and no limit of acceleration can be kept",
@@ -368,7 +368,7 @@ class TrajectoryShaper:
         )
 
     def _excess(self, motion, quiet, start):
-        """By which factor time must be stretched, 1 or less where the limits are kept from `start` on."""
+        """Factor by which time must be stretched; 1 or less if the limits are kept from `start` on."""
         if np.isinf(self._velocity).all() and np.isinf(self._acceleration).all():
             return 1.0
         shaped = ShapedMotion(motion, self.modes, quiet)
@@ -378,7 +378,7 @@ class TrajectoryShaper:
         places = (knots[:-1, None] + np.diff(knots)[:, None] * PLACES).ravel()
         _, v, a = shaped.states(places).reshape(3, len(lengths), PLACES.size, -1)
         speed = np.abs(v).max(axis=(0, 1))
-        # Between two places where the acceleration changes sign, it is taken as linear: so it is for cubic pieces.
+        # Between two places where the acceleration changes sign, it is taken as linear, as it is for cubic pieces.
         before, after = a[:, :-1], a[:, 1:]
         turns = before * after < 0.0
         top = v[:, :-1] + 0.5 * lengths[:, :, None] * before**2 / np.where(
@@ -405,14 +405,14 @@ class TrajectoryShaper:
         return None if plan is None else self.take(plan)
 
     def prepared_stop(self, now_ns, quick=False):
-        """Stop on the unshaped motion's own way, and shape it; None where nothing moves.
+        """Stop on the unshaped motion's own path, and shape it; None if nothing moves.
 
         Parameters
         ----------
         now_ns : int
             [ns]
         quick : bool
-            Without a new time law, which takes longer to be made and less to stop.
+            Without a new time law, which takes longer to compute and stops sooner.
 
         Returns
         -------
@@ -431,9 +431,9 @@ class TrajectoryShaper:
         return self._planned(stopped, quiet, self._epoch_ns, start, last, 1.0, fresh=False)
 
     def _slowed(self, motion, quiet, start):
-        """The motion up to `start` [s], then along its own way to rest, no harder than allowed.
+        """The motion up to `start` [s], then along its own path to rest, no harder than allowed.
 
-        Where the shaped motion can't stop earlier within its limits than it ends, it goes on as it is.
+        If the shaped motion can't stop within its limits before it ends, it goes on as it is.
         """
         ahead = np.linspace(start, motion.knots[-1], 200)
         speed, acceleration = (np.abs(motion.derivative(k, ahead)).max(axis=0) for k in (1, 2))
@@ -452,7 +452,7 @@ class TrajectoryShaper:
         return motion
 
     def _planned(self, motion, quiet, epoch_ns, begin, last, stretch, fresh):
-        """Shape a whole motion, and write what is left of it from a time on."""
+        """Shape a whole motion, and write its part from a time on."""
         shaped = ShapedMotion(motion, self.modes, quiet)
         knots = shaped.knots()
         knots = knots[knots > begin + (0.0 if fresh else HANDOVER)]
@@ -469,7 +469,7 @@ class TrajectoryShaper:
                 hint="send fewer: a quintic polynomial joins them",
             )
         times_ns = np.rint((knots - begin) * SECOND).astype(np.int64)
-        # At the rounded times: between points that are microseconds apart, the rounding would be an acceleration.
+        # At the rounded times, since between points microseconds apart the rounding would be an acceleration.
         states = shaped.states(begin + times_ns / SECOND)[: motion.fields]
         states[0][-1], states[1:, -1] = motion.end, 0.0
         begin_ns, end_ns = (epoch_ns + round(t * SECOND) for t in (begin, shaped.end))
@@ -508,7 +508,7 @@ def _slower(fields, stretch):
 
 
 def _joined(before, begin, start, times, fields):
-    """The unshaped motion: what was commanded before, then the points from a state `begin` (3, n) at `start` [s]."""
+    """The unshaped motion: the motion `before`, then the points from a state `begin` (3, n) at `start` [s]."""
     if times[0] > 0.0:
         times = np.concatenate([[0.0], times])
         fields = [np.vstack([b, values]) for b, values in zip(begin, fields, strict=False)]

@@ -1,25 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""A motion that is made again and again: its time law is corrected by the ringing that it was seen to leave.
+r"""Corrects the time law of a motion that is repeated, by the ringing that it leaves.
 
-A time law of `time_law` is as good as the modes that it knows. A sensor that sees the ringing after the motion (a
-gauge, an accelerometer at the tip) tells what it has missed. In T seconds after the end its channels c have
+A time law of `time_law` is as good as the modes that it knows. A sensor that measures the ringing after the motion (a
+gauge, an accelerometer at the tip) shows what it has missed. In T seconds after the end its channels c read
 
 .. math:: y_c(t) = \mathrm{Re} \sum_m a_{mc}\, e^{p_m t} + d_c, \qquad a_{mc} = h_{mc}\, z_m,
 
-with the poles p measured where the motion ends, and the answer h of the sensor to each mode: :math:`a_{mc}/z_m` after
-a small motion there, whose z is known. Least squares give the z that the motion has left. With
+with the poles p measured where the motion ends, and the response h of the sensor to each mode. It is
+:math:`a_{mc}/z_m` after a small motion there, whose z is known. Least squares give the z that the motion has left. With
 :math:`Z = \partial z/\partial x` from `time_law`, the next motion has the accelerations :math:`x + \delta`,
 
 .. math:: \min_\delta \max_k |\delta_k| \quad\text{with}\quad z + Z\delta = 0,\;
     |\ddot\sigma| \le a,\; 0 \le \dot\sigma \le v,\; \dot\sigma(T) = 0,\; \sigma(T) = 1,
 
-a linear programme: the least change, since Z is only about right. Each trial corrects Z by what the change has done
+a linear programme for the least change, since Z is only about right. Each trial corrects Z by the effect of the change
 (Broyden 1965, *A class of methods for solving nonlinear simultaneous equations*),
 
 .. math:: Z \leftarrow Z + \frac{(\Delta z - Z\delta)\,\delta^T}{\delta^T\delta}.
 
-A trial that swings more than the best one is not followed: the next one starts at the best, with half the change. What
-is learned in trials is what iterative learning control learns; here in the few unknowns that ring.
+A trial that swings more than the best one is not followed: the next one starts at the best, with half the change. The
+trials are iterative learning control of the few unknowns that ring.
 """
 
 import numpy as np
@@ -31,13 +31,13 @@ from . import time_law
 from .modes import Modes
 from .time_law import DIRECTIONS, FACTORS, ITERATIONS, SLACK
 
-#: Periods of the lowest mode after the end that are looked at.
+#: Number of periods of the lowest mode after the end that are evaluated.
 PERIODS = 2.0
 #: Largest change of an acceleration in one trial, over the largest acceleration [-].
 CHANGE = 0.3
-#: What is left counts for so much more than the change; after a trial that is worse, changes get so much smaller.
+#: Weight of the remaining ringing relative to the change; and factor on the changes after a trial that is worse.
 LEFT, LESS = 100.0, 0.5
-#: Cells in which a motion's z is integrated.
+#: Number of cells in which a motion's z is integrated.
 CELLS = 2000
 
 
@@ -63,13 +63,13 @@ class Ringing:
         Parameters
         ----------
         times : (k,) array_like
-            From the end of the motion on; later ones than `window` are not used [s].
+            Times from the end of the motion on; later ones than `window` are not used [s].
         readings : (k, c) array_like
 
         Raises
         ------
         MessageError
-            Where there are too few, or one is not finite.
+            If there are too few, or one is not finite.
         """
         times, readings = np.asarray(times, float), np.asarray(readings, float)
         used = (times >= 0.0) & (times <= self.window)
@@ -85,14 +85,14 @@ class Ringing:
         return found[:count] + 1j * found[count : 2 * count]
 
     def answer(self, small, motion, times, readings):
-        """What the sensor has of each mode, for each unit of z, (m, c) complex.
+        """Response of the sensor to each mode, per unit of z, (m, c) complex.
 
         Parameters
         ----------
         small, motion : PiecewiseMotion
             The small motion after which the readings are, and the one to be learned, with the same end and direction.
         times, readings
-            As of `amplitudes`, after the small motion.
+            As for `amplitudes`, after the small motion.
         """
         first, last = small.knots[[0, -1]]
         step = (last - first) / CELLS
@@ -108,30 +108,30 @@ class Trials:
     Parameters
     ----------
     motion : PiecewiseMotion
-        A straight one from rest to rest, whose points give velocities.
+        A straight motion from rest to rest, whose points give velocities.
     modes : Modes
-        As of `time_law.retimed`.
+        As for `time_law.retimed`.
     ringing : Ringing
-        As many modes as `modes` has, ascending alike. Their frequencies correct those of `modes` on the whole way, as
-        factors; the time law's duration stays.
+        As many modes as `modes` has, in the same ascending order. Their frequencies correct those of `modes` on the
+        whole path, as factors; the time law's duration stays.
     answer : (m, c) array_like
-        Of the sensor, see `Ringing.answer`.
+        Response of the sensor, see `Ringing.answer`.
     velocity, acceleration : (n,) array_like
-        Limits, as of `time_law.retimed`.
+        Limits, as for `time_law.retimed`.
 
     Attributes
     ----------
     motion : PiecewiseMotion
-        To be made next.
+        The motion to make next.
     best : PiecewiseMotion
-        The one that has swung least; at first that of `time_law.solved`, by the modes alone: a trial shows the rest.
+        The motion that has swung least; at first that of `time_law.solved`, by the modes alone: a trial shows the rest.
     least : float
-        What it has swung; inf at first.
+        Swing of the best motion; inf at first.
 
     Raises
     ------
     DesignError
-        Where there is no such time law.
+        If there is no such time law.
     """
 
     def __init__(self, motion, modes: Modes, ringing, answer, velocity=np.inf, acceleration=np.inf):
@@ -160,9 +160,9 @@ class Trials:
         Parameters
         ----------
         times, readings
-            As of `Ringing.amplitudes`.
+            As for `Ringing.amplitudes`.
         swing : float
-            What the motion has left, in any unit that stays the same; the least is the best.
+            Vibration that the motion has left, in any unit that stays the same; the least is the best.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class Trials:
             self._slope = self._slope + np.outer(wrong, change) / size
 
     def _change(self, x, z):
-        """The least change of x that takes out z, as far as `CHANGE` allows; None: there is none."""
+        """The least change of x that removes z, as far as `CHANGE` allows; None if there is none."""
         law, count = self._law, x.size
         velocity, acceleration = law.limits
         around = np.exp(-2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slow control laws: what tracks the trajectory as if the arm were rigid. One law per file."""
+"""Slow control laws, which track the trajectory as if the arm were rigid; one law per file."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Model following that learns the payload (Slotine & Li 1987), on the slow subsystem (10).
 
-The rigid arm's inverse dynamics are affine in the payload's mass and inertia, here p times those of the arm file, with
-the same centre of mass. The regressor Y is the torque of one more payload, the difference of two rigid arms. With C in
-Christoffel's form, so that Mdot - 2C is skew-symmetric, and a, B, C of the arm with the payload's estimate,
+The rigid arm's inverse dynamics are affine in the payload's mass and inertia. These are p times those of the arm file,
+with the same centre of mass. The regressor Y is the torque that one more payload takes, the difference of two rigid
+arms. C has Christoffel's form, so that Mdot - 2C is skew-symmetric. With a, B, C of the arm with the estimated payload,
 
 .. math::
     s &= \dot e + \Lambda e, \qquad \dot q_r = \dot q_{ref} + \Lambda e, \qquad e = q_{ref} - q, \\
@@ -12,24 +12,24 @@ Christoffel's form, so that Mdot - 2C is skew-symmetric, and a, B, C of the arm 
     0 \le \hat p \le p_{max} \text{ by projection}.
 
 :math:`V = \tfrac12 s^TM_ps + (\hat p - p)^2/2\gamma` has :math:`\dot V = -s^TM_{\hat p}\Lambda_2 s \le 0` (for
-joints of equal rates): s and with it the error vanish, whatever the payload, and :math:`\hat p \to p` where the
+joints of equal rates). Therefore s and with it the error go to zero for every payload, and :math:`\hat p \to p` if the
 motion excites it. -Lambda and -Lambda_2 are the poles of `kp` and `kv`, :math:`(\sigma + \Lambda)(\sigma +
-\Lambda_2) = \sigma^2 + k_v\sigma + k_p`: with the payload known this is model following (13) plus C s, which is
+\Lambda_2) = \sigma^2 + k_v\sigma + k_p`. With the payload known, the law is model following (13) plus C s; C s is
 zero for one joint.
 
 The estimate is part of the law's `model`, so that the slow manifold bends the links as that payload would. Otherwise
-the fast control would work against any payload but the arm file's, and mislead the estimate.
+the fast control would work against any payload other than the arm file's, and mislead the estimate.
 
-There is no leakage: at rest without gravity Y vanishes and the estimate stays. It is kept from one trajectory to the
-next and forgotten when a session begins. Nothing is learnt while the slow torque is beyond a joint's limit, or from s
-within `dead_zone`: these errors do not come from the payload.
+There is no leakage: at rest without gravity Y is zero and the estimate stays. The estimate is kept from one trajectory
+to the next and forgotten when a session begins. The law does not adapt while the slow torque is beyond a joint's limit,
+nor to an s within `dead_zone`: these errors do not come from the payload.
 
-gamma is normalised by the arm, so that `adaptation_gain` means the same for each: under a steady acceleration A of
-one joint the estimate's error obeys :math:`\ddot{\tilde p} + \Lambda_2\dot{\tilde p} + \Gamma A^2\tilde p = 0`;
-under gravity gamma is lowered so that the weight alone adds no more than :math:`\Lambda_2^2` to the last factor.
+gamma is normalised so that `adaptation_gain` means the same for every arm. Under a steady acceleration A of one joint
+the estimate's error obeys :math:`\ddot{\tilde p} + \Lambda_2\dot{\tilde p} + \Gamma A^2\tilde p = 0`. Under gravity,
+gamma is lowered so that the weight alone adds no more than :math:`\Lambda_2^2` to the last factor.
 
-Assumes that everything but the payload is known, and that the payload in the arm file is not zero: the estimate is a
-multiple of it.
+The law assumes that everything except the payload is known, and that the payload in the arm file is not zero, since the
+estimate is a multiple of it.
 """
 
 import numpy as np
@@ -42,7 +42,7 @@ from .base import KP, KV, SlowLaw
 from .payload_model import PayloadModel, need_payload
 from .rigid_arm import rigid_arm
 
-#: Configurations over which the adaptation's gain is normalised.
+#: Number of configurations over which the adaptation gain is normalised.
 CONFIGURATIONS = 64
 
 
@@ -52,7 +52,7 @@ class AdaptiveModelFollowing(SlowLaw):
     Attributes
     ----------
     payload_scale : float
-        The estimate: payload in parts of the arm file's.
+        The estimate: the payload as a multiple of the arm file's.
     learning : float
         Rate of the estimate at the last sample [1/s].
     model : PayloadModel
@@ -61,7 +61,7 @@ class AdaptiveModelFollowing(SlowLaw):
     Raises
     ------
     DesignError
-        When the arm file's payload is nothing, or kp and kv ask for oscillating poles.
+        If the arm file's payload is zero, or kp and kv give oscillating poles.
     """
 
     learns = True
@@ -69,14 +69,14 @@ class AdaptiveModelFollowing(SlowLaw):
         KP,
         KV,
         parameter("adaptation_gain", 0.3, "s^2", 0.0, 1e4).described(
-            "How fast adaptive model following learns: the square of the estimate's frequency per squared"
-            " acceleration; 0.0: not at all."
+            "How fast adaptive model following learns: squared frequency of the estimate per squared acceleration; 0.0:"
+            " not at all."
         ),
         parameter("payload_scale_max", 5.0, "-", 1.0, 1e3).described(
-            "Largest payload that adaptive model following believes in, in parts of the arm file's."
+            "Upper bound of adaptive model following's payload estimate, as a multiple of the arm file's payload."
         ),
         parameter("dead_zone", 0.02, "rad/s", 0.0, 10.0).described(
-            "Adaptive model following learns nothing from a combined error s below it: what bending and noise leave."
+            "Adaptive model following ignores a combined error s below this value, such as bending and noise cause."
         ),
     )
 
@@ -99,11 +99,11 @@ class AdaptiveModelFollowing(SlowLaw):
 
     @property
     def payload_scale(self):
-        """The estimate, in parts of the arm file's payload [-]."""
+        """The estimate, as a multiple of the arm file's payload [-]."""
         return self.model.scale
 
     def _rates(self):
-        """Lambda and Lambda_2, (n,) [1/s]."""
+        """Set Lambda and Lambda_2, (n,) [1/s]."""
         kp, kv = self.kp, self.kv
         root = kv**2 - 4.0 * kp
         if root.min() < 0.0:
@@ -138,20 +138,20 @@ class AdaptiveModelFollowing(SlowLaw):
         return gain / (inertia + gain * weight / slowest**2)
 
     def _difference(self, q, qd):
-        """Velocity and gravity torque of one payload more, shape (n,) [N m]."""
+        """Velocity and gravity torque that one more payload takes, shape (n,) [N m]."""
         return self._two.forces(q, qd) - self._one.forces(q, qd)
 
     @staticmethod
     def _coriolis(forces, q, v, w):
-        """C(q, v) w in Christoffel's form: the symmetric bilinear form of the quadratic C(q, v) v."""
+        """C(q, v) w in Christoffel's form: the symmetric bilinear form of the quadratic form C(q, v) v."""
         return 0.25 * (forces(q, v + w) - forces(q, v - w))
 
     def error_gains(self):
-        # C s is none of a single joint.
+        # C s is zero for a single joint.
         return (self.kp, self.kv) if self.model.n_joints == 1 else None
 
     def regressor(self, q, qd, speed, acceleration):
-        """Y of the module for qd_r and qdd_r: torque that one payload more takes, shape (n,) [N m]."""
+        """Y of the module for qd_r and qdd_r: torque that one more payload takes, shape (n,) [N m]."""
         extra = self._two.mass_matrix(q) - self._one.mass_matrix(q)
         Y = extra @ acceleration + self._difference(q, self._at_rest)
         if q.size > 1:

@@ -22,62 +22,62 @@ KV = parameter("kv", [5.0], "1/s", 0.0, 1e4, length="joints").described(
 class SlowLaw(Law, ABC):
     """Slow control u_slow of (12), designed on the slow subsystem (10).
 
-    Registered by name in the entry-point group ``flexarm.slow_laws``; its parameters are ``slow.<name>`` in the
-    controller node. `torque` runs on the control path.
+    A slow law is registered by name in the entry-point group ``flexarm.slow_laws``. Its parameters are
+    ``slow.<name>`` in the controller node. `torque` runs on the control path.
 
     Parameters
     ----------
     model : ArmModel
-        The arm. What the law keeps as its `model` is the arm as it believes it to be: the terms that `torque` and
-        the slow manifold get are taken from there.
+        The arm. The law's attribute `model` is the arm as the law estimates it: `torque` and the slow manifold receive
+        the terms of that model.
     parameters : dict
         Checked values of `PARAMETERS`, arrays at full length.
     """
 
     #: True for a law that leaves the joints free.
     drifts = False
-    #: True for a law whose `model` changes with what it learns: the slow manifold follows it, a simulation of the
-    #: arm file's arm would not, so that such a law goes without feed-forward.
+    #: True for a law whose `model` changes as it learns. The slow manifold follows that change; a simulation of the arm
+    #: file's arm would not. So such a law has no feed-forward.
     learns = False
 
-    #: True for a law whose torque is its `nominal` one and a `feedback` of the error, which needs no terms.
+    #: True for a law whose torque is its `nominal` torque plus a `feedback` of the error that needs no terms.
     separate = False
 
     def error_gains(self):
         """Gains (kp, kv) of the tracking error's dynamics, e'' = -kv e' - kp e, each (n,); None for another law.
 
-        The slow manifold is continued off the reference by them.
+        The slow manifold uses them for states off the reference.
         """
         return None
 
     def nominal(self, terms, acceleration):
-        """What this law gives on its reference, learnt states aside: the rigid arm's torque, shape (n,) [N m].
+        """Torque of this law on its reference, without learnt states: the rigid arm's torque, shape (n,) [N m].
 
-        For `terms` of (2) on the reference, and the reference's `acceleration`, (n,) [rad/s^2].
+        `terms` are those of (2) on the reference; `acceleration` is the reference's, (n,) [rad/s^2].
         """
         return slow_torque(terms, acceleration)
 
     def nominal_at(self, q, qd, acceleration):
-        """As `nominal`, at joint positions and velocities, (n,) [rad], [rad/s], without their terms."""
+        """As `nominal`, for joint positions and velocities, (n,) [rad], [rad/s], instead of terms."""
         return self.nominal(self.model.terms(q, qd), acceleration)
 
     def torque_at(self, q, qd, reference):
-        """As `torque`, without the terms; a law that needs few of them takes less time for it."""
+        """As `torque`, without given terms, which takes less time for a law that needs few of them."""
         return self.torque(q, qd, reference, self.model.terms(q, qd))
 
     def feedback(self, q, qd, motion):
-        """Torque beyond the `nominal` one on a `motion`, shape (n,) [N m]; of a `separate` law."""
+        """Torque of a `separate` law beyond its `nominal` torque on a `motion`, shape (n,) [N m]."""
         raise NotImplementedError
 
     def without_friction(self):
-        """Within this context the law cancels no friction beyond its `nominal` torque, as where a joint slides fast."""
+        """Context in which the law cancels no friction beyond its `nominal` torque, as for a joint that slides fast."""
         return nullcontext()
 
     def saw(self, torque):
         """Take note of the whole torque (n,) [N m] that this sample asks for, before any limit."""
 
     def absorb(self, torque):
-        """Take a torque (n,) [N m] into the law's own integral, if it has one; what was taken, (n,)."""
+        """Take a torque (n,) [N m] into the law's own integral, if it has one; return what was taken, (n,)."""
         return np.zeros_like(torque)
 
     @abstractmethod

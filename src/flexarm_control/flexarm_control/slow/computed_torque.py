@@ -5,18 +5,18 @@ r"""Computed torque with an integral, on the slow subsystem (10) of Siciliano & 
     \bar u = B^{-1}(x_c)\,[\ddot q_{ref} + k_v\dot e + k_p e + w - a(x_c)], \qquad
     \dot w = k_i e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q,
 
-the inverse dynamics of the rigid arm (Coriolis, gravity and friction are in a) under feedback (Luh, Walker & Paul
-1980; Sciavicco & Siciliano, *Modelling and control of robot manipulators*, ch. 6). With ``ki = 0`` and
-``feedforward_at: state`` it is `model_following` (13) itself. It differs in two things:
+This is the inverse dynamics of the rigid arm (a contains Coriolis, gravity and friction terms) with feedback (Luh,
+Walker & Paul 1980; Sciavicco & Siciliano, *Modelling and control of robot manipulators*, ch. 6). With ``ki = 0`` and
+``feedforward_at: state`` it is `model_following` (13) itself. It differs from that law in two things:
 
-- the integral w removes the error at rest that a wrong payload, gravity or friction d causes; (13) keeps B d / kp.
-  It is stable for ki < kp kv (Routh). w stops at its clamp, and while the slow torque is beyond a joint's limit it
-  does not grow in that direction;
-- x_c, where a and B are taken: the measured state, or with ``feedforward_at: reference`` the reference
+- The integral w removes the error at rest that a wrong payload, gravity or friction d causes; (13) leaves B d / kp.
+  The loop is stable for ki < kp kv (Routh). w stops at its limit. While the slow torque is beyond a joint's limit, w
+  does not grow in that direction.
+- a and B are taken at x_c. This is the measured state or, with ``feedforward_at: reference``, the reference
   (q_ref, qd_ref). Then no noise of measured speeds is fed back through Coulomb friction and Coriolis terms. They are
   cancelled to first order in the error only; the gains must do the rest.
 
-Assumes that a and B are known up to a slowly varying torque; linear error dynamics with ``state`` alone.
+The law assumes that a and B are known up to a slowly varying torque. Its error dynamics are linear with ``state`` only.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ class ComputedTorque(SlowLaw):
     Raises
     ------
     DesignError
-        When ki is not below kp kv: the error would grow.
+        If ki is not below kp kv, because the error would grow.
     """
 
     PARAMETERS = (
@@ -49,10 +49,10 @@ class ComputedTorque(SlowLaw):
             "Integral gain of computed torque, below kp kv; 0.0: none."
         ),
         parameter("integral_limit", [2.0], "rad/s^2", 0.0, 1e4, length="joints").described(
-            "Largest acceleration that the integral of computed torque asks for."
+            "Largest acceleration that the integral of computed torque may add."
         ),
         parameter("feedforward_at", "state", choices=("state", "reference")).described(
-            "Where computed torque takes inertia, Coriolis, gravity and friction: at the measured state or at the"
+            "Where computed torque evaluates inertia, Coriolis, gravity and friction: at the measured state or at the"
             " reference."
         ),
     )
@@ -93,7 +93,7 @@ class ComputedTorque(SlowLaw):
             self.integral *= self.ki > 0.0
 
     def advance(self, dt):
-        # Where the torque is at its limit, an error that pushes farther has nothing to gain.
+        # Where the torque is beyond its limit, an error that pushes further is not integrated.
         grows = np.where(self._beyond * self._error > 0.0, 0.0, self._error)
         self.integral += dt * self.ki * grows
         np.clip(self.integral, -self._most, self._most, out=self.integral)

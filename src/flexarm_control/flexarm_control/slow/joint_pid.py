@@ -1,44 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Stiffness, damping and integral of each joint about the rigid arm's torque on the reference.
+r"""PID feedback of each joint about the rigid arm's torque on the reference.
 
 .. math::
     \bar u = B^{-1}(x_{ref})\,[\ddot q_{ref} - a(x_{ref})] + K_q e + K_{\dot q}\dot e + w, \qquad
     \dot w = K_w e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q,
 
-what is fed back passing a low pass (`flexarm_control.low_pass`),
+The feedback passes a low-pass filter (`flexarm_control.low_pass`).
 
-with diagonal gains in torque per angle: the slow law that `flexarm design` makes gains for, together with a constant
+The gains are diagonal, in torque per angle. `flexarm design` makes gains for this slow law, together with a constant
 feedback of the deflections (`fast.type: fixed_gain`) on the manifold of the reference. Gains of (13) multiply the
-inertia of the arm file; these do not, so that what is designed for an uncertain arm does not change with what the
-file says. The integral leaves no error at rest under a payload, friction or weight that the file does not have. On a
-motion that the model explains e is zero, and so is w. w stops at its limit, and does not grow while the torque is
-beyond the joint's.
+inertia of the arm file. These do not, so a design for an uncertain arm does not change with the file's numbers. The
+integral leaves no error at rest under a payload, friction or weight that the file does not have. On a motion that the
+model explains e is zero, and so is w. w stops at its limit, and does not grow while the torque is beyond the joint's.
 
-Friction holds a joint where its error is small: the integral moves it on slowly, and a vibration whose torque is less
-than the friction is not damped. So a part :math:`\gamma` of the arm file's Coulomb friction, less that of the motion,
-which :math:`\bar u` has, is added without the low pass:
+Friction holds a joint whose error is small. The integral moves it on only slowly, and a vibration whose torque is less
+than the friction is not damped. So a fraction :math:`\gamma` of the arm file's Coulomb friction is added without the
+low-pass filter, minus the friction of the motion, which :math:`\bar u` already contains:
 
 .. math:: u_f = \gamma\,f_c\,[\tanh((\dot q + \lambda e)/v_s) - \tanh(\dot q_{ref}/v_s)] .
 
-A joint that sticks beside its place is pushed back as if it moved there at the speed :math:`\lambda e`: without that it
-creeps, and the integral grows until it breaks loose. With :math:`\gamma` below 1 friction is left over, whatever the
-delay: by itself this moves no joint whose place is where it is. In turn, where the friction is less than :math:`\gamma`
-of the file's, small movements grow.
+A joint that sticks beside its reference is pushed back as if it moved there at the speed :math:`\lambda e`. Without
+that it creeps, and the integral grows until the joint breaks loose. With :math:`\gamma` below 1 some friction remains,
+whatever the delay, so this torque alone moves no joint that is at its reference. But if the true friction is less than
+:math:`\gamma` times the file's, small movements grow.
 
-Of a light joint that moves far until the torque answers, little can be cancelled so. Where its error alone decides, the
-delay does not turn the torque against it, and nearly all friction can be overcome. So a part :math:`\beta` of the
-friction, less what is cancelled already, is added as for a joint that goes back at the speed :math:`\lambda_\beta e`
-from where it sticks,
+A light joint moves far before the torque answers, so little of its friction can be cancelled in this way. If the torque
+depends on the error alone, the delay does not turn it against the joint, and nearly all friction can be overcome. So a
+fraction :math:`\beta` of the friction, minus what is already cancelled, is added as for a joint that goes back from
+where it sticks at the speed :math:`\lambda_\beta e`:
 
 .. math:: u_b = \max(\beta - \gamma, 0)\,f_c
-    \,[\tanh((\dot q_{ref} + \lambda_\beta e)/v_s) - \tanh(\dot q_{ref}/v_s)] ,
+    \,[\tanh((\dot q_{ref} + \lambda_\beta e)/v_s) - \tanh(\dot q_{ref}/v_s)] .
 
-which the friction itself damps: at an amplitude and frequency at which it is a stiffness k, the friction is a damper of
-at least :math:`k/\omega`. Linear loops are judged without these torques; `flexarm design` has loops of joints that
-stick, with both (`robust.loop`).
+The friction itself damps this torque: at an amplitude and frequency at which the torque acts as a stiffness k, the
+friction acts as a damper of at least :math:`k/\omega`. Linear loops are judged without these two torques; `flexarm
+design` also has loops of joints that stick, with both (`robust.loop`).
 
-The gains may be several sets, each made for a configuration of its own (`flexarm_control.schedule`). w is a torque, not
-an angle: a change of K_w does not move it.
+There may be several sets of gains, each made for its own configuration (`flexarm_control.schedule`). w is a torque, not
+an angle, so a change of K_w does not move it.
 """
 
 from contextlib import contextmanager
@@ -70,31 +69,31 @@ class JointPid(SlowLaw):
 
     PARAMETERS = (
         parameter("stiffness", [0.0], "N m/rad", 0.0, 1e9, length="joints*").described(
-            "K_q of joint_pid: torque per joint error; a set for each configuration of the schedule, or one for all."
+            "K_q of joint_pid: torque per joint error; one set for each configuration of the schedule, or one for all."
         ),
         parameter("damping", [0.0], "N m s/rad", -1e9, 1e9, length="joints*").described(
-            "K_qd of joint_pid: torque per error of the joint's speed; sets as of stiffness."
+            "K_qd of joint_pid: torque per error of the joint's speed; sets as for stiffness."
         ),
         parameter("integral", [0.0], "N m/(rad s)", 0.0, 1e9, length="joints*").described(
-            "K_w of joint_pid: torque per integrated joint error; 0.0: none; sets as of stiffness."
+            "K_w of joint_pid: torque per integrated joint error; 0.0: no integral; sets as for stiffness."
         ),
         parameter("integral_torque", [0.0], "N m", 0.0, 1e9, length="joints").described(
             "Largest torque of joint_pid's integral; 0.0: the torque limit."
         ),
         parameter("friction", [0.0], "-", 0.0, 1.0, length="joints").described(
-            "Part of the arm file's Coulomb friction that joint_pid cancels where a joint moves otherwise than its"
-            " motion; a joint with less friction than that part may hunt."
+            "Fraction of the arm file's Coulomb friction that joint_pid cancels where a joint deviates from its motion;"
+            " a joint with less friction than that fraction may hunt."
         ),
         parameter("return_rate", 0.0, "1/s", 0.0, 1e4).described(
-            "Where joint_pid cancels friction, a joint's speed counts as greater by its error times this: one that"
-            " sticks beside its place is pushed back."
+            "For joint_pid's friction cancellation, a joint's error times this is added to its speed, so that a joint"
+            " that sticks beside its reference is pushed back."
         ),
         parameter("breakaway", [0.0], "-", 0.0, 1.0, length="joints").described(
-            "Part of the arm file's Coulomb friction, with what joint_pid cancels of it, that is overcome where a joint"
-            " sticks beside its place."
+            "Fraction of the arm file's Coulomb friction, including what joint_pid cancels, that is overcome where a"
+            " joint sticks beside its reference."
         ),
         parameter("breakaway_rate", 0.0, "1/s", 0.0, 1e4).described(
-            "Speed over error at which a joint goes back from where it sticks, with breakaway."
+            "Speed per error at which breakaway takes a joint to go back from where it sticks."
         ),
         SCHEDULE,
         BANDWIDTH,
@@ -157,7 +156,7 @@ class JointPid(SlowLaw):
 
     def advance(self, dt):
         self._low_pass.advance(dt)
-        # Where the torque is at its limit, an error that pushes farther has nothing to gain.
+        # Where the torque is beyond its limit, an error that pushes further is not integrated.
         grows = np.where(self._beyond * self._error > 0.0, 0.0, self._error)
         self.integral += dt * self.gain * grows
         np.clip(self.integral, -self._most, self._most, out=self.integral)
@@ -178,9 +177,9 @@ class JointPid(SlowLaw):
         return u
 
     def _friction(self, qd, expected):
-        """What is cancelled of the friction at joint speeds qd and the present error, beyond that of `expected` speeds.
+        """Friction that is cancelled at joint speeds qd and the present error, beyond that at the `expected` speeds.
 
-        All are (n,), in rad/s; what is returned is in N m.
+        Speeds are (n,) [rad/s]; the result is (n,) [N m].
         """
         slides, more = self._slides, self._more
         np.multiply(self._rates, self._error, out=slides[:2])
@@ -207,7 +206,7 @@ class JointPid(SlowLaw):
         self._beyond[:] = np.sign(torque) * (np.abs(torque) > self._limit)
 
     def _on(self, reference):
-        """The rigid arm's torque on the reference, shape (n,) [N m]; what was asked for last is remembered."""
+        """The rigid arm's torque on the reference, shape (n,) [N m]; the last result is cached."""
         motion = reference.position, reference.velocity, reference.acceleration
         key = b"".join(x.tobytes() for x in motion)
         if key != self._known[0]:

@@ -4,11 +4,11 @@ r"""Linear model following, (17) of Siciliano & Book (1986), for any number of j
 .. math::
     \bar u = B^{-1}(q)\,[\ddot\theta_{ref} + k_v(\dot\theta_{ref} - \dot\theta) + k_p(\theta_{ref} - \theta)]
 
-with B of the slow subsystem (10), whose inverse is the rigid arm's inertia: `m11` for one link. The
-published law multiplies by ``1/h11``, with H = M^-1: the slow poles are then not where they were designed
+The inverse of B of the slow subsystem (10) is the rigid arm's inertia, `m11` for one link. The published law
+multiplies by ``1/h11`` instead, with H = M^-1. The slow poles are then not where they were designed
 (-2.14 +- 0.88j instead of the double pole -2.5 on the paper's arm). ``gain: h11`` reproduces that.
 
-Assumes that the nonlinear terms a of (10) are small: no gravity, slow motion. Else use `model_following`.
+The law assumes that the nonlinear terms a of (10) are small: no gravity, slow motion. Otherwise use `model_following`.
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ class LinearModelFollowing(SlowLaw):
         KP,
         KV,
         parameter("gain", "m11", choices=("m11", "h11")).described(
-            "What multiplies the acceleration: m11, the inverse of B in (10), or h11, as published."
+            "Factor of the acceleration: m11, the inverse of B in (10), or h11, as published."
         ),
     )
 
@@ -41,7 +41,7 @@ class LinearModelFollowing(SlowLaw):
 
     def B_inverse(self, terms):
         """The matrix in front of the bracket of (17), shape (n, n) [kg m^2]."""
-        # M of (2) and gravity's K1, which B depends on besides, are each one object as long as they are constant.
+        # B depends on M of (2) and on gravity's K1. Each stays the same object as long as it is constant.
         M, K1, inverse = self._cached
         if M is not terms.M or K1 is not terms.K1:
             n = terms.n
@@ -74,7 +74,7 @@ class LinearModelFollowing(SlowLaw):
         return self._inverse_at(q, qd) @ self._wanted(q, qd, reference)
 
     def _inverse_at(self, q, qd):
-        """`B_inverse` at joint positions and velocities; terms are made where it may change with them."""
+        """`B_inverse` at joint positions and velocities; computes terms only if it may change with them."""
         if self.model.same_inertia and self._cached[2] is not None:
             return self._cached[2]
         return self.B_inverse(self.model.terms(q, qd))

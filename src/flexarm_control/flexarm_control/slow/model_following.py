@@ -6,11 +6,11 @@ r"""Model following with compensation, the general form (13)-(14) of Siciliano &
     v = \Lambda_0 q + \Lambda_1\dot q + \hat u, \\
     \hat u &= \ddot\theta_{ref} - \Lambda_0\theta_{ref} - \Lambda_1\dot\theta_{ref},
 
-the last line being the inverse of the reference model (14). The slow subsystem (10) then follows the
+The last line is the inverse of the reference model (14). The slow subsystem (10) then follows the
 reference perfectly: the error obeys e'' = Lambda_1 e' + Lambda_0 e, with Lambda_0 = -diag(kp) and
-Lambda_1 = -diag(kv), and stays zero once it is.
+Lambda_1 = -diag(kv), and stays zero once it is zero.
 
-Assumes that a(x) and B(x) are known: gravity, friction and payload as in the arm file.
+The law assumes that a(x) and B(x) are known: gravity, friction and payload are as in the arm file.
 """
 
 import numpy as np
@@ -45,7 +45,7 @@ class ModelFollowing(SlowLaw):
         return self.model.slow_torque(q, qd, acceleration)
 
     def _wanted(self, q, qd, reference):
-        """v, the acceleration that the slow subsystem is to have, (n,) [rad/s^2]; overwritten by the next call."""
+        """v, the desired acceleration of the slow subsystem, (n,) [rad/s^2]; overwritten by the next call."""
         kernels.compiled().wanted_acceleration(
             q, qd, reference.position, reference.velocity, reference.acceleration, self.Lambda0, self.Lambda1, self._v
         )  # fmt: skip

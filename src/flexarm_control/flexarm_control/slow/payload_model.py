@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm under another payload than its file's: what a law that learns the payload believes."""
+"""Model of the arm with another payload than its file's, for a law that learns the payload."""
 
 import numpy as np
 
@@ -9,9 +9,9 @@ from flexarm_dynamics.singular_perturbation import slow_torque
 
 
 class PayloadModel:
-    """A model whose `terms` are those of `scale` payloads; all else is the arm file's.
+    """A model whose `terms` are those of `scale` payloads; everything else is the arm file's.
 
-    In the same mode shapes every term of (2) is affine in the payload's mass and inertia, so that two models give all.
+    For given mode shapes, every term of (2) is affine in the payload's mass and inertia. So two models give all others.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ class PayloadModel:
     Attributes
     ----------
     scale : float
-        Payload in parts of the arm file's, set at will [-].
+        Payload as a multiple of the arm file's; may be set at any time [-].
     """
 
     #: The inertia changes with `scale`.
@@ -48,7 +48,7 @@ class PayloadModel:
         return slow_torque(self.terms(q, qd), acceleration)
 
     def _of(self, terms_of):
-        """Terms that both models have of one state, or of several, at the present scale."""
+        """Terms at the present scale, from those of both models, for one state or several."""
         one, more = terms_of(self._one), self.scale - 1.0
         if more == 0.0:
             return one
@@ -56,7 +56,7 @@ class PayloadModel:
 
 
 def need_payload(model, who):
-    """Refuse a model without payload: `who` learns it in parts of the arm file's."""
+    """Refuse a model without payload, because `who` learns it as a multiple of the arm file's."""
     load = model.arm.payload
     if not load.mass and not np.any(load.inertia):
         raise DesignError(

@@ -6,19 +6,19 @@ r"""Resolved acceleration control (Luh, Walker & Paul 1980) of the tip, on the s
     b &= \ddot x_{ref} + \kappa_v(\dot x_{ref} - \dot x) + \kappa_p(x_{ref} - x) - \dot J\dot q, \\
     y &= y_0 + J^{*}(b - J y_0), \qquad y_0 = \ddot q_{ref} + k_v\dot e + k_p e,
 
-with x the tip of the straight arm, J (3, n) the Jacobian of its position, and x_ref and its derivatives those of
-the joints' reference by the same kinematics. Where J has full rank the tip's error obeys
-:math:`\ddot e_x = -\kappa_v\dot e_x - \kappa_p e_x` whatever the joints do; the joints follow the joints' own law
-y_0 in the directions that do not move the tip (the null space, for redundant arms).
+Here x is the tip of the straight arm and J (3, n) the Jacobian of its position. x_ref and its derivatives follow from
+the joints' reference by the same kinematics. Where J has full rank, the tip's error obeys
+:math:`\ddot e_x = -\kappa_v\dot e_x - \kappa_p e_x` whatever the joints do. In the directions that do not move the tip
+(the null space, for redundant arms) the joints follow their own law y_0.
 
 :math:`J^*` is the damped inverse of Nakamura & Hanafusa (1986), :math:`\sigma/(\sigma^2 + \lambda^2)` for each
-singular value, with the damping :math:`\lambda^2 = \varepsilon^2 - \sigma^2` that sets in where sigma is below
-epsilon and grows towards the singularity: 1/sigma above epsilon, sigma/epsilon^2 below. There the tip's law has the
-weight (sigma/epsilon)^2 and y_0 has the rest. So a stretched arm, or a direction in which a planar arm or one joint
-can't move its tip, needs no case of its own.
+singular value. The damping :math:`\lambda^2 = \varepsilon^2 - \sigma^2` sets in where sigma is below epsilon and grows
+towards the singularity. The inverse is thus 1/sigma above epsilon and sigma/epsilon^2 below. Below, the tip's law has
+the weight (sigma/epsilon)^2 and y_0 has the rest. So a stretched arm, or a direction in which a planar arm or one joint
+can't move its tip, needs no special case.
 
-Assumes that a and B are known as in the arm file, and that the arm is on the same side of a singularity as its
-reference (elbow up or down): else the tip arrives with the other elbow.
+The law assumes that a and B are as in the arm file, and that the arm is on the same side of a singularity as its
+reference (elbow up or down). Otherwise the tip arrives with the other elbow.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ from .rigid_arm import Tip
 
 
 class ResolvedAcceleration(SlowLaw):
-    """Tip and null space resolved; see the module."""
+    """Resolved acceleration of tip and null space; see the module."""
 
     PARAMETERS = (
         KP,
@@ -43,7 +43,7 @@ class ResolvedAcceleration(SlowLaw):
             "Velocity gain of the tip in resolved acceleration."
         ),
         parameter("singularity", 0.05, "-", 1e-6, 1.0).described(
-            "Singular value of the tip's Jacobian, in parts of the arm's reach, below which resolved acceleration"
+            "Singular value of the tip's Jacobian, as a fraction of the arm's reach, below which resolved acceleration"
             " hands over to the joints' gains."
         ),
     )
@@ -62,7 +62,7 @@ class ResolvedAcceleration(SlowLaw):
         return (Vt.T * gain) @ U.T
 
     def acceleration(self, q, qd, reference):
-        """y, the joint acceleration asked for, shape (n,) [rad/s^2]."""
+        """y, the desired joint acceleration, shape (n,) [rad/s^2]."""
         x, J, bias = self.tip.at(q, qd)
         x_ref, J_ref, bias_ref = self.tip.at(reference.position, reference.velocity)
         b = J_ref @ reference.acceleration + bias_ref - bias

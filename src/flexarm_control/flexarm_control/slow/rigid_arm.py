@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm that the slow laws see: the same chain with rigid links, and its tip."""
+"""The rigid arm that the slow laws use: the same chain with rigid links, and the kinematics of its tip."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from flexarm_dynamics.models.chain import Chain
 
 
 def rigid_arm(arm):
-    """Model of an arm of any model with its links taken as rigid: a `Chain` without modes."""
+    """An arm of any model with its links taken as rigid: a `Chain` without modes."""
     return Chain(
         replace(
             arm,
@@ -39,7 +39,7 @@ class Tip:
         )
 
     def at(self, q, qd):
-        """Position, Jacobian and what the acceleration has beyond J qdd.
+        """Position and Jacobian of the tip, and its acceleration beyond J qdd.
 
         Parameters
         ----------
@@ -53,7 +53,7 @@ class Tip:
         J : ndarray, shape (3, n)
             Jacobian of the position [m].
         bias : ndarray, shape (3,)
-            dJ/dt qd [m/s^2]: the links' centripetal accelerations, and those of axes that are turned.
+            dJ/dt qd [m/s^2]: the links' centripetal accelerations, and those due to joint axes that turn.
         """
         R, p = self._chain.frames(q)
         axes = np.einsum("ijk,ik->ij", R[:-1], self._axes)

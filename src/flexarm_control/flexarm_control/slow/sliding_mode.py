@@ -9,19 +9,19 @@ The arm's own a', B' may differ from the model's by
 
 .. math:: |a_i - a'_i| \le F_i, \qquad \|B'B^{-1} - 1\|_\infty \le \rho < 1,
 
-the bounds `disturbance_bound` (payload's weight, friction, a push) and `inertia_error`. With
+where `disturbance_bound` gives F (payload's weight, friction, a push) and `inertia_error` gives rho. With
 
 .. math::
     k_i = F_i + \eta_i + \rho\,(w + K), \qquad w = \|\ddot q_r - a\|_\infty, \qquad
     K = \frac{\max_i(F_i + \eta_i) + \rho w}{1 - \rho},
 
-every joint outside its layer fulfils the sliding condition :math:`\tfrac12\tfrac{d}{dt}s_i^2 \le -\eta_i|s_i|`:
-K is the largest k: k_i also covers the other joints' switching, which acts through the wrong inertia. The layer is
-reached within :math:`(|s_i(0)| - \phi_i)/\eta_i` and kept, and in it :math:`|e_i|` falls to
+every joint outside its layer fulfils the sliding condition :math:`\tfrac12\tfrac{d}{dt}s_i^2 \le -\eta_i|s_i|`.
+K is the largest k_i. So k_i also covers the other joints' switching, which acts through the wrong inertia. s reaches
+the layer within :math:`(|s_i(0)| - \phi_i)/\eta_i` and stays in it. Inside, :math:`|e_i|` falls to
 :math:`\phi_i/\Lambda_i`.
 
 Inside the layer the law is linear, with bandwidth k/phi. If the layer is too thin, that bandwidth excites the fast
-subsystem, which (10) leaves out; `warnings` names the width to take.
+subsystem, which (10) neglects; `warnings` names the width to take.
 """
 
 import numpy as np
@@ -31,28 +31,28 @@ from flexarm_dynamics.singular_perturbation import slow_subsystem
 
 from .base import SlowLaw
 
-#: The layer's bandwidth is to stay below this part of the lowest frequency of the links, joints locked.
+#: The layer's bandwidth should stay below this fraction of the links' lowest frequency with locked joints.
 SEPARATION = 1.0 / 3.0
 
 
 class SlidingMode(SlowLaw):
-    """Sliding mode against bounded errors of the model; see the module."""
+    """Sliding mode for bounded errors of the model; see the module."""
 
     PARAMETERS = (
         parameter("lambda", [2.5], "1/s", 0.0, 1e4, length="joints").described(
             "Rate at which the error decays on the sliding surface."
         ),
         parameter("eta", [0.5], "rad/s^2", 1e-6, 1e4, length="joints").described(
-            "Rate at which the sliding surface is approached at least."
+            "Minimum rate at which the sliding surface is approached."
         ),
         parameter("disturbance_bound", [0.5], "rad/s^2", 0.0, 1e4, length="joints").described(
-            "Bound of what sliding mode does not know of the joint's acceleration."
+            "Bound of the unmodelled acceleration of the joint, for sliding mode."
         ),
         parameter("inertia_error", 0.0, "-", 0.0, 0.95).described(
-            "Bound of the relative error of the inertia that sliding mode stands: of B' B^-1 - 1, largest row sum."
+            "Bound of the relative error of the inertia, for sliding mode: largest row sum of B' B^-1 - 1."
         ),
         parameter("boundary_layer", [0.4], "rad/s", 1e-6, 1e3, length="joints").described(
-            "Half width of the layer around the sliding surface in which sliding mode is linear."
+            "Half width of the boundary layer, in which sliding mode is linear."
         ),
     )
 
@@ -80,7 +80,7 @@ class SlidingMode(SlowLaw):
         )
 
     def switching_gain(self, acceleration):
-        """k of the module for the acceleration that the model is to make up for, qdd_r - a; (n,) [rad/s^2]."""
+        """k of the module for the acceleration that the model has to supply, qdd_r - a; (n,) [rad/s^2]."""
         asked = self.rho * np.abs(acceleration).max()
         most = (self._sure.max() + asked) / (1.0 - self.rho)
         return self._sure + asked + self.rho * most

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories: checks a `trajectory_msgs/JointTrajectory` and makes the reference from it.
+"""Trajectories: checks a `trajectory_msgs/JointTrajectory`, and computes the reference from it.
 
 Trajectories mean the same as for the joint_trajectory_controller of ros2_controllers (Jazzy). The
 fields of the points select the interpolation:
@@ -18,7 +18,7 @@ holds its position. Near positions may be smoothed, and a last point may move, s
 
 This package is stricter than the joint_trajectory_controller: it refuses partial joint goals (unless allowed),
 velocities without positions, fields that some points lack, a start in the past (unless late ones are joined), and
-what needs more torque than the joints have.
+trajectories that need more torque than the joints have.
 
 Time is the stamp of the samples, in integer nanoseconds; no clock is read.
 """

@@ -38,7 +38,7 @@ SUFFIXES = (".csv", *YAML_SUFFIXES)
 #: CSV prefix of each field of a point.
 _PREFIXES = {"positions": "q", "velocities": "qd", "accelerations": "qdd"}
 _POINT_KEYS = (*_PREFIXES, "effort", "time_from_start")
-# The C loader is some ten times faster, and not everywhere there.
+# The C loader is some ten times faster, but not available everywhere.
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
@@ -46,7 +46,7 @@ _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 def read(
     path, joint_names, position_low=None, position_high=None, velocity_max=None
 ) -> JointTrajectoryData:
-    """Read a trajectory from a file; with stamp 0: it starts when it is offered.
+    """Read a trajectory from a file, with stamp 0, so that it starts when it is offered.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def read(
     Raises
     ------
     TrajectoryError
-        With the file, the line and column (CSV) or the point and field (YAML), and the value.
+        It names the file, the line and column (CSV) or the point and field (YAML), and the value.
     """
     path, joint_names = Path(path), tuple(joint_names)
     reader = _reader(path)
@@ -86,7 +86,7 @@ def read(
 
 
 def write(path, trajectory):
-    """Write a trajectory to a file; `read` gives it back bit by bit, its stamp aside.
+    """Write a trajectory to a file; `read` gives it back bit by bit, except for its stamp.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def _wanted(joint_names):
 
 
 def _csv_columns(header, joint_names, line):
-    """Where t and each field's columns are; fields that are not there have none."""
+    """Indices of the columns of t and of each field; missing fields have none."""
     count = range(1, len(joint_names) + 1)
     fields = {field: [f"{prefix}{i}" for i in count] for field, prefix in _PREFIXES.items()}
     known = {"t"}.union(*fields.values())
@@ -222,7 +222,7 @@ def _from_yaml(text, joint_names):
         # `ros2 topic echo` ends each message with a line of dashes.
         documents = [d for d in yaml.load_all(text, _LOADER) if d is not None]
     except Exception as error:
-        # Not only YAML's own errors: PyYAML raises others on a scalar that its tag does not fit, and on endless
+        # Not only YAML's own errors: PyYAML raises others for a scalar that does not fit its tag, and for endless
         # nesting.
         mark = getattr(error, "problem_mark", None)
         raise TrajectoryError(
@@ -273,7 +273,7 @@ def _yaml_values(values, field):
         try:
             if isinstance(value, bool):
                 raise TypeError
-            # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number.
+            # YAML 1.1 takes 1e-3 (no dot) for text, but the number is meant.
             out.append(float(value))
         except NOT_NUMBERS:
             raise TrajectoryError("is not a number", field=f"{field}[{i}]", value=value) from None

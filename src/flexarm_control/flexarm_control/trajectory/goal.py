@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""When a motion has reached its goal: the joints within their tolerances, and the tip at rest.
+r"""Decides when a motion has reached its goal: the joints within their tolerances, and the tip at rest.
 
 A joint_trajectory_controller ends a goal when the *joints* are there; an arm with flexible links then still swings.
 Here the tip has to rest, too: it may have moved by no more than `tip` within half a period of the lowest bending mode,
@@ -7,7 +7,7 @@ Here the tip has to rest, too: it may have moved by no more than `tip` within ha
 .. math:: \max_{t-T/2 \le a, b \le t} |p(a) - p(b)|_\infty \le p_{max}, \qquad p = p(q, \delta)
 
 from joint positions and modal amplitudes. A harmonic motion of the amplitude A moves by A to 2 A in that time, whatever
-its phase, so that A is at most :math:`p_{max}`. Where the tip rests does not count: an unknown payload bends the links.
+its phase. So A is at most :math:`p_{max}`. Where the tip rests does not count, as an unknown payload bends the links.
 """
 
 from collections import deque
@@ -23,8 +23,8 @@ from .values import SECOND
 
 PARAMETERS = (
     parameter("constraints.trajectory", [0.0], "rad", 0.0, 100.0, length="joints").described(
-        "How far a joint may be from its reference on the way; beyond it the goal is aborted and the arm stopped."
-        " 0.0: not judged."
+        "How far a joint may be from its reference during the motion; beyond it the goal is aborted and the arm"
+        " stopped. 0.0: not judged."
     ),
     parameter("constraints.goal", [0.0], "rad", 0.0, 100.0, length="joints").described(
         "How far a joint may be from the end of its trajectory for the goal to succeed. 0.0: not judged."
@@ -33,17 +33,17 @@ PARAMETERS = (
         "Largest speed of a joint for the goal to succeed. 0.0: not judged."
     ),
     parameter("constraints.tip", 0.0, "m", -1.0, 100.0).described(
-        "How far the tip may have moved in the last half period of the lowest mode, once to twice its amplitude, for a"
+        "How far the tip may have moved in the last half period of the lowest mode (once to twice its amplitude) for a"
         " goal to succeed; 0.0: a thousandth of the arm's reach; negative: not judged."
     ),
     parameter("constraints.goal_time", 0.0, "s", 0.0, 1e4).described(
-        "A goal that has not succeeded so long after the end of its trajectory is aborted. 0.0: never."
+        "A goal that has not succeeded this long after the end of its trajectory is aborted. 0.0: never."
     ),
 )
 
-#: Looks at the tip within half a period, at least.
+#: Minimum number of looks at the tip within half a period.
 LOOKS = 8
-#: Part of the reach that the tip may swing where nothing else is stated [-].
+#: Fraction of the reach that the tip may swing if nothing else is stated [-].
 OF_REACH = 1e-3
 
 
@@ -60,7 +60,7 @@ class Code(IntEnum):
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What a goal keeps to; infinite where something is not judged.
+    """Tolerances of a goal; infinite where something is not judged.
 
     Attributes
     ----------
@@ -79,25 +79,25 @@ class Tolerances:
 
 
 def tolerances(names, reach, values, path=(), goal=(), time=0.0, tip=0.0):
-    """The tolerances of a goal: the parameters', and its own where it has some.
+    """The tolerances of a goal: its own if it has some, otherwise those of the parameters.
 
     Parameters
     ----------
     names : sequence of str
-        Of the n joints.
+        Names of the n joints.
     reach : float
-        Of the arm [m].
+        Reach of the arm [m].
     values : mapping
-        Of `PARAMETERS`.
+        Values of `PARAMETERS`.
     path, goal : sequence of (name, position, velocity)
         [rad], [rad/s]; 0: the parameter counts, negative: not judged.
     time, tip : float
-        [s], [m]; the same.
+        [s], [m]; likewise.
 
     Raises
     ------
     TrajectoryError
-        For a joint that the arm has not, or a number that is not finite.
+        If a joint is not one of the arm's, or a number is not finite.
     """
     n = len(names)
     speed = values["constraints.stopped_velocity_tolerance"]
@@ -143,18 +143,18 @@ class TipSwing:
         self._places = deque()
 
     def add(self, stamp_ns, place):
-        """Take the tip's place (3,) [m] at a stamp; one that is not later than the last is left out."""
+        """Take the tip's place (3,) [m] at a stamp; one that is not later than the last is ignored."""
         places = self._places
         if places and stamp_ns <= places[-1][0]:
             return
         places.append((stamp_ns, np.array(place, float)))
-        # The oldest one that is needed lies half a period back, or `LOOKS` looks.
+        # The oldest place that is needed lies half a period back, or `LOOKS` looks.
         while len(places) > LOOKS + 1 and places[1][0] <= stamp_ns - self._span:
             places.popleft()
 
     @property
     def value(self):
-        """The largest way along one axis [m]; NaN until the time is over."""
+        """Largest movement along one axis [m]; NaN until half a period is over."""
         places = self._places
         if len(places) < LOOKS or places[-1][0] - places[0][0] < self._span:
             return np.nan
@@ -171,7 +171,7 @@ class Outcome:
     text : str
         What happened, in words.
     swing : float
-        Of the tip [m]; NaN where it was not judged.
+        Swing of the tip [m]; NaN if it was not judged.
     """
 
     code: Code
@@ -187,9 +187,9 @@ class GoalCheck:
     joint_names : sequence of str
     tolerances : Tolerances
     end_ns : int
-        When the trajectory ends, or soonest can [ns].
+        When the trajectory ends, or can end at the earliest [ns].
     period : float
-        Of the lowest bending mode [s].
+        Period of the lowest bending mode [s].
     """
 
     def __init__(self, joint_names, tolerances, end_ns, period):
@@ -197,7 +197,7 @@ class GoalCheck:
         self._swing, self._since = TipSwing(period), None
 
     def on_the_way(self, error, velocity_error):
-        """Judge a look at the arm on its way; errors (n,) [rad], [rad/s]. An `Outcome` ends the goal."""
+        """Judge the arm during the motion, by errors (n,) [rad], [rad/s]; an `Outcome` ends the goal."""
         at = self._beyond((error, velocity_error), self.tolerances.path)
         if at is None:
             return None
@@ -205,16 +205,16 @@ class GoalCheck:
         return Outcome(Code.PATH_TOLERANCE_VIOLATED, text)
 
     def at_the_end(self, stamp_ns, error, velocity, tip):
-        """Judge a look at the arm whose reference holds the end.
+        """Judge the arm while its reference holds the end.
 
         Parameters
         ----------
         stamp_ns : int
             [ns]; before `end_ns` the reference is not there yet.
         error, velocity : ndarray, shape (n,)
-            Of the joints from the end [rad], and their speed [rad/s].
+            Distance of the joints from the end [rad], and their speed [rad/s].
         tip : ndarray, shape (3,)
-            [m]
+            Place of the tip [m].
 
         Returns
         -------

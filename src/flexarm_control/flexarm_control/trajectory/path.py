@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Piecewise polynomials through the points of a trajectory, and the way along them that ends in a stop.
+r"""Piecewise polynomials through the points of a trajectory, and stops along them.
 
 A stop slows down the trajectory's own time: the reference is :math:`q_r(s(t))`, with :math:`\dot s` from 1 to 0. The
 arm stays on its path, and is never faster than the motion. Over the stop's duration T, with x = t / T,
@@ -12,10 +12,10 @@ whose first three derivatives are zero at both ends. Acceleration, jerk and snap
     \ddot q &= q_r^{(2)}\dot s^2 + q_r^{(1)}\ddot s \\
     q^{(3)} &= q_r^{(3)}\dot s^3 + 3 q_r^{(2)}\dot s\ddot s + q_r^{(1)} s^{(3)},
 
-are then as continuous as those of the trajectory. A slow manifold is made of them, and moves without a step.
+are then as continuous as those of the trajectory. So a slow manifold, which depends on them, moves without a step.
 
-A trajectory that ends before such a stop does, and hardly farther, is followed to its end at its own speed: it comes to
-rest sooner, and with the motion that was planned for the links.
+If a trajectory ends before such a stop would, and hardly farther, it is followed to its end at its own speed. It then
+comes to rest sooner, and with the motion that was planned for the links.
 """
 
 import math
@@ -25,16 +25,16 @@ import numpy as np
 from .. import kernels
 from .values import SECOND
 
-#: Places of a polynomial at which its acceleration and jerk are looked at, as fractions of its length.
+#: Places of a polynomial at which its acceleration and jerk are evaluated, as fractions of its length.
 PLACES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-#: Velocity and acceleration at a smooth end are at most so much of the largest [-].
+#: Velocity and acceleration at a smooth end are at most this fraction of the largest [-].
 SMOOTH = 1e-6
 
 
 def hermite(duration, before, after):
     """Return the coefficients of the polynomials between two states.
 
-    The polynomial of degree 2m - 1 that meets m given derivatives at either end (m = 1: linear,
+    Each polynomial has degree 2m - 1 and meets m given derivatives at either end (m = 1: linear,
     2: cubic, 3: quintic), e.g. Biagiotti & Melchiorri (2008), sections 2.1.1, 2.1.4, 2.1.6.
 
     Parameters
@@ -94,9 +94,9 @@ def _peaks(coefficients, lengths):
 class Path:
     """A piecewise polynomial from the reference at its start to its last point.
 
-    Knot 0 is the start, knot i the i-th point; segment i leads from knot i to knot i + 1. The
-    coefficients of the first segment are computed in `begin`, when the reference at the start is
-    known, those of all others here. With a first point at time 0, segment 0 has no length and is
+    Knot 0 is the start, knot i the i-th point; segment i leads from knot i to knot i + 1. `begin`
+    computes the coefficients of the first segment, when the reference at the start is known; the
+    constructor computes all others. With a first point at time 0, segment 0 has no length and is
     never evaluated.
 
     Parameters
@@ -106,15 +106,16 @@ class Path:
     derivatives : sequence of m (k, n) arrays
         Positions, then velocities, then accelerations.
     trajectory_id : int
-        The trajectory of the path; 0: a stop.
+        Number of the path's trajectory; 0: a stop.
     coast : Coast, optional
         How it comes to rest after a last point that moves.
     effort : (k, n) array, optional
-        Of the points [N m], linear between them, from that at the start; the last one is held, or fades in the coast.
+        Effort at the points [N m], linear between them and from the start's; the last one is held, or fades in the
+        coast.
 
     """
 
-    #: Whether the way's time is not that of the arm.
+    #: Whether the path's time differs from the arm's.
     scaled = False
     #: The piece that a path ends in: its last state, held.
     END = -1
@@ -154,7 +155,7 @@ class Path:
 
     @classmethod
     def of(cls, trajectory, trajectory_id=0):
-        """The path of a `JointTrajectoryData`, under a number."""
+        """The path of a `JointTrajectoryData`, with a number."""
         return cls(
             trajectory.times_ns,
             trajectory.fields,
@@ -182,7 +183,7 @@ class Path:
 
     @property
     def followed(self):
-        """The path whose way is taken: this one."""
+        """The path that is followed: this one."""
         return self
 
     @property
@@ -203,7 +204,7 @@ class Path:
         return 1.0
 
     def elapsed(self, stamp_ns):
-        """Time of this path that a stamp stands for, from its start [s]."""
+        """Time of this path at a stamp, from its start [s]."""
         return (stamp_ns - self.start_ns) / SECOND
 
     def pace(self, stamp_ns):
@@ -222,14 +223,14 @@ class Path:
     def peaks(self):
         """Largest speed, acceleration and jerk of every joint on the path, (3, n) [rad/s], [rad/s^2], [rad/s^3].
 
-        Without the jumps between polynomials; from six places of each, which is right to a few thousandths.
+        Jumps between polynomials are left out. Six places of each are evaluated, which is right to a few thousandths.
         """
         first = self._knots_ns[1:2, None] / SECOND
         return np.maximum(_peaks(self._coefficients[:1], first), self._rest_peaks)
 
     @property
     def ends_smoothly(self):
-        """Whether velocity and acceleration come to zero at the end, beside the largest on the path."""
+        """Whether velocity and acceleration are zero at the end, compared with the largest on the path."""
         last = _derivatives(self._coefficients[-1:], self.lengths[-1:, None])[:2, 0]
         return bool((np.abs(last) <= SMOOTH * self.peaks()[:2]).all())
 
@@ -314,7 +315,7 @@ class Path:
     def near(self, stamp_ns, offset, out):
         """Fill `out` (3, n) with the state `offset` [s] from `stamp_ns`, on the polynomial at that stamp.
 
-        Whether the stamp is before the end; after it the state is that of the end, at any offset.
+        Returns whether the stamp is before the end. After it the state is that of the end, at any offset.
         """
         elapsed_ns = max(stamp_ns - self.start_ns, 0)
         if elapsed_ns >= self.duration_ns:
@@ -365,7 +366,7 @@ def around(path, stamp_ns, offset, step, out):
 
 
 class Slowing:
-    """Time law of a stop: s(t) and its derivatives, from s' = 1 to rest; see the module.
+    """Time law of a stop: s(t) with its derivatives, from s' = 1 to rest; see the module.
 
     Parameters
     ----------
@@ -412,11 +413,11 @@ class SlowedPath:
     Parameters
     ----------
     path : Path or ScaledPath
-        Begun, and not changed any more.
+        A path that has begun and is not changed any more.
     start_ns : int
         Stamp at which slowing begins [ns].
     duration_ns : int
-        Of the slowing [ns].
+        Duration of the slowing [ns].
     """
 
     trajectory_id = 0
@@ -437,7 +438,7 @@ class SlowedPath:
         return self._end[0]
 
     def _place(self, s):
-        """Stamp of the path, and what is left to it [s], at a time s of the path since the stop began [s]."""
+        """Stamp of the path, and remainder [s], at a time s of the path since the stop began [s]."""
         whole = int(s * SECOND)
         return self._way.start_ns + self._begin_ns + whole, s - whole / SECOND
 
@@ -447,7 +448,7 @@ class SlowedPath:
         return self._place(self._slowing.at(since)[0])
 
     def elapsed(self, stamp_ns):
-        """Time of the path that a stamp stands for, from the path's start [s]."""
+        """Time of the path at a stamp, from the path's start [s]."""
         place, rest = self._at(stamp_ns)
         return self._way.elapsed(place) + rest
 
@@ -465,7 +466,7 @@ class SlowedPath:
         return self._way.pushes
 
     def effort(self, stamp_ns, out):
-        """Fill `out` (n,) with the effort at a stamp [N m]: the path's, as far as it moves."""
+        """Fill `out` (n,) with the effort at a stamp [N m]: the path's, in proportion to its speed."""
         self._way.effort(self._at(stamp_ns)[0], out)
         out *= self.speed(stamp_ns)
 
@@ -482,7 +483,7 @@ class SlowedPath:
     def near(self, stamp_ns, offset, out):
         """Fill `out` (3, n) with the state `offset` [s] from `stamp_ns`, on the path's polynomial at that stamp.
 
-        Whether the stamp is before the end; after it the state is that of the end, at any offset.
+        Returns whether the stamp is before the end. After it the state is that of the end, at any offset.
         """
         elapsed_ns = max(stamp_ns - self.start_ns, 0)
         if elapsed_ns >= self.duration_ns:
@@ -505,7 +506,7 @@ class FinishedPath:
     Parameters
     ----------
     path : Path
-        Begun, and not changed any more.
+        A path that has begun and is not changed any more.
     start_ns : int
         Stamp of the stop [ns].
     """
@@ -532,7 +533,7 @@ class FinishedPath:
 
 
 def at_rate(state, rate, change):
-    """Turn a state (3, n) by a path's own time into one by the arm's, for a rate [-] and its change [1/s]."""
+    """Convert a state (3, n) from a path's own time to the arm's, for a rate [-] and its change [1/s]."""
     _, velocity, acceleration = state
     acceleration *= rate * rate
     acceleration += change * velocity

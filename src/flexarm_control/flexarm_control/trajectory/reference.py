@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generates the reference of the joints: holds, trajectories and stops, and what is added to the torque."""
+"""Generates the reference of the joints, with holds, trajectories and stops, and the torque to add."""
 
 import copy
 from dataclasses import dataclass, replace
@@ -23,25 +23,25 @@ from .values import (
     seconds,
 )
 
-#: Deceleration from a measured velocity, where none is given [rad/s^2].
+#: Deceleration from a measured velocity, if none is given [rad/s^2].
 GENTLE = 2.0
-#: Least duration of that braking, over the period of the lowest bending mode.
+#: Minimum duration of that braking, over the period of the lowest bending mode.
 BRAKING_PERIODS = 0.5
-#: The braking may always take so much way [rad].
+#: Distance that the braking may always take [rad].
 BEYOND = 0.02
-#: A start that is farther ahead is a stamp of another clock [ns].
+#: A start that is farther ahead is taken for a stamp of another clock [ns].
 FARTHEST_START = 3600 * SECOND
-#: A stop's acceleration and jerk over the motion's own largest.
+#: Ratios of a stop's acceleration and jerk to the motion's own largest.
 MORE = 1.15, 1.3
 #: A motion that is slower than this fraction of what the joint could do is stopped faster than it would stop itself.
 SLOW_FRACTION = 0.2
-#: Least duration of a stop, over the period of the lowest bending mode: of a fast motion, and of a slow one.
+#: Minimum duration of a stop, over the period of the lowest bending mode: of a fast motion, and of a slow one.
 PERIODS = 1.2, 1.5
-#: A stop follows a motion to its end, if that is sooner, and this fraction of the stop's way farther at most [-].
+#: A stop follows a motion to its end, if that is sooner and at most this fraction of the stop's distance farther [-].
 FARTHER = 0.2
-#: At so many places of the way beyond that is judged; rounding [rad].
+#: Number of places of the way beyond at which this is judged; rounding [rad].
 LOOKS, BEYOND_ROUNDING = 9, 1e-9
-#: Least time in which speed scaling changes, or an effort goes [s].
+#: Minimum time in which speed scaling changes, or an effort fades [s].
 MIN_RAMP = 0.1
 #: A turn of a continuous joint [rad].
 TURN = 2.0 * np.pi
@@ -67,8 +67,8 @@ class ReferenceGenerator:
     """Generates the joints' reference: holds, follows trajectories, stops.
 
     The newest accepted trajectory wins. From its start on it replaces the one that is followed. A trajectory that was
-    accepted earlier and has not begun is replaced at once, except that one which only waits for the next sample still
-    begins if the newer one starts later.
+    accepted earlier and has not begun is replaced at once. One exception: a trajectory that only waits for the next
+    sample still begins if the newer one starts later.
 
     Parameters
     ----------
@@ -79,24 +79,24 @@ class ReferenceGenerator:
     velocity_max : (n,) array_like, optional
         Limit of the mean speed between the reference at the start and the first point [rad/s].
     period : float
-        Of the lowest bending mode [s]; a stop takes longer, and so hardly excites it. 0: none.
+        Period of the lowest bending mode [s]; a stop takes longer, and so hardly excites it. 0: there is no such mode.
     continuous : (n,) array_like of bool, optional
-        Joints that turn without an end: a trajectory is moved by whole turns, to the one that is nearest.
+        Joints that turn without an end; a trajectory is moved by whole turns to the nearest one.
 
     Attributes
     ----------
     position, velocity, acceleration : (n,) arrays
         The reference at the last sampled stamp [rad], [rad/s], [rad/s^2]; overwritten in place.
     effort : (n,) array
-        What is added to the torque there [N m].
+        Torque to add there [N m].
     speed_scaling : float
         Factor on the time of trajectories, from 0 to 1; see `scale`.
     active : bool
-        A trajectory is being followed: from its start until its end.
+        Whether a trajectory is being followed, from its start until its end.
     finished : bool
-        The trajectory last followed has reached its end, which is held.
+        Whether the trajectory last followed has reached its end, which is held.
     stopping : bool
-        A stop is braking.
+        Whether a stop is braking.
     accepted_id : int
         The number of the last accepted trajectory; 0: none since the reset.
     joins : bool
@@ -151,18 +151,18 @@ class ReferenceGenerator:
         self.effort[:] = 0.0
 
     def start(self, position, stamp_ns, velocity=None, deceleration=GENTLE):
-        r"""Hold a measured position, or brake from how the arm moves; earlier trajectories are forgotten.
+        r"""Hold a measured position, or brake from the arm's present motion; earlier trajectories are forgotten.
 
         With a velocity v the reference goes on in its direction from the position, and comes to rest as in `stop`,
-        after :math:`T = \max_j 35 |v_j| / (16 D_j)` and at least half of `period`, v T / 2 farther. No joint leaves the
-        range of a trajectory that is given up for the sake of that half period.
+        after :math:`T = \max_j 35 |v_j| / (16 D_j)` and at least half of `period`, v T / 2 farther. That half period
+        does not move any joint out of the range of a trajectory that is given up.
 
         Parameters
         ----------
         position : (n,) array_like
             [rad]
         stamp_ns : int
-            From when on [ns].
+            Stamp from which this holds [ns].
         velocity : (n,) array_like, optional
             [rad/s]; zero, or not given: hold.
         deceleration : float or (n,) array_like
@@ -191,7 +191,7 @@ class ReferenceGenerator:
         self._last_ns = stamp_ns
 
     def _least_braking(self, position, velocity):
-        """Time that `start` takes for the links' sake [s]; shorter if it led out of the trajectory's range."""
+        """Minimum time of `start` for the links' sake [s]; shorter if it led out of the trajectory's range."""
         least = BRAKING_PERIODS * self._period
         if not (self.active and least > 0.0):
             return least
@@ -206,7 +206,7 @@ class ReferenceGenerator:
     def offer(self, trajectory: JointTrajectoryData, judge=None) -> Verdict:
         """Accept a validated trajectory, or return why it is refused; then it changes nothing.
 
-        ``judge(trajectory, start)`` may refuse it with a `TrajectoryError`, too; `start` as of `start_of`.
+        ``judge(trajectory, start)`` may refuse it with a `TrajectoryError`, too; `start` is that of `start_of`.
         """
         if self.repeats(trajectory):
             return Verdict(
@@ -228,11 +228,11 @@ class ReferenceGenerator:
         return verdict
 
     def ahead(self, trajectory):
-        """What is followed of a trajectory: continuous joints the short way, what is left of one that is joined.
+        """The trajectory as it is followed: continuous joints go the short way, one that is joined is cut.
 
-        One that is joined, see `joins`, starts now, with fewer points. An arm that is not on its way, within the
-        tolerance of a start, is given at least the lowest mode's period to get there: nearer points are left out, but
-        the last. The trajectory itself where nothing is changed. Any thread may ask.
+        A trajectory that is joined (see `joins`) starts now, with fewer points. An arm that is not on its path, within
+        the tolerance of a start, has at least the lowest mode's period to get there; nearer points are left out, except
+        for the last. If nothing is changed, this is the trajectory itself. Any thread may ask.
         """
         now, start = self._last_ns, trajectory.stamp_ns
         if now is None or trajectory.joint_names != self.joint_names:
@@ -274,7 +274,7 @@ class ReferenceGenerator:
     def start_of(self, stamp_ns):
         """State (3, n) that a trajectory with `stamp_ns` (0: now) starts from; None while there is none.
 
-        On a copy, so that any thread may ask. For stamp 0 the reference goes on until the trajectory is offered.
+        It works on a copy, so any thread may ask. For stamp 0 the reference goes on until the trajectory is offered.
         """
         if self._last_ns is None:
             return None
@@ -294,7 +294,7 @@ class ReferenceGenerator:
 
     @property
     def rate(self):
-        """How fast the time of trajectories goes at the last stamp [-]: on its way to `speed_scaling`."""
+        """How fast the time of trajectories goes at the last stamp [-], on its way to `speed_scaling`."""
         path = self._path
         if path is not None and path.scaled and path.trajectory_id and self.active:
             return path.law.at(self._last_ns)[1]
@@ -443,7 +443,7 @@ class ReferenceGenerator:
             around(self._path, self._last_ns, 0.0, step, out)
 
     def _follow(self, path, start_ns):
-        """Change to a path, from the reference at its start, and at the factor on the time."""
+        """Change to a path, from the reference at its start and with the factor on the time."""
         before, factor = self._path, self.speed_scaling
         law = TimeLaw(start_ns, 0.0, factor)
         if before is not None and before.scaled and before.trajectory_id:
@@ -465,23 +465,23 @@ class ReferenceGenerator:
         return out
 
     def scale(self, factor, deceleration=GENTLE, given=True):
-        """Have the time of trajectories go at a factor from 0 to 1 from now on; see module `scaling`.
+        """Scale the time of trajectories by a factor from 0 to 1 from now on; see module `scaling`.
 
-        A trajectory that is followed goes over to it within the time of a stop, as of `stop`; stops are not scaled.
+        A trajectory that is followed changes to the factor within the time of a `stop`. Stops are not scaled.
 
         Parameters
         ----------
         factor : float
             [-]; 0: the arm rests on its way.
         deceleration : float or (n,) array_like
-            As of `stop` [rad/s^2].
+            As for `stop` [rad/s^2].
         given : bool or (n,) array_like of bool
-            As of `stop`.
+            As for `stop`.
 
         Raises
         ------
         TrajectoryError
-            If the factor is not within 0 and 1; nothing changes then.
+            If the factor is not within 0 and 1; then nothing changes.
         """
         if not 0.0 <= factor <= 1.0:
             raise TrajectoryError(
@@ -504,9 +504,9 @@ class ReferenceGenerator:
         self._path = ScaledPath(path.followed, law)
 
     def look_at(self, stamp_ns):
-        """State (3, n) of what is followed, or will be, at a stamp `stamp_ns` [ns]; None while there is nothing.
+        """State (3, n) of the present or coming reference at a stamp `stamp_ns` [ns]; None while there is none.
 
-        What has been accepted and waits counts from its start on. Nothing changes.
+        An accepted trajectory that waits counts from its start on. The call changes nothing.
         """
         if self._last_ns is None:
             return None
@@ -528,16 +528,16 @@ class ReferenceGenerator:
     def stop(self, stamp_ns, deceleration, given=True):
         """Bring the reference to rest along its path, then hold; cancel all trajectories.
 
-        The trajectory's own time is slowed down (module `path`), over a time T which is at least `PERIODS` of the
-        lowest bending mode, and the first of a geometric sequence in which on all of the way
+        The trajectory's own time is slowed down (module `path`) over a time T of at least `PERIODS` of the lowest
+        bending mode. T is the first value of a geometric sequence with which, on all of the way,
 
-        - where the deceleration D is given: slowing down takes at most D,
+        - if the deceleration D is given: slowing down takes at most D,
         - otherwise: acceleration and jerk are at most `MORE` times the motion's own largest, or, for a slow motion,
           what slowing down with `SLOW_FRACTION` D takes.
 
         The bounds hold for every joint. A trajectory that ends before, without a jump, and no more than `FARTHER` of
-        the stop's way farther, is followed to its end at its own speed. Of any other that ends before, the stop's
-        reference ends with it. A stop within a stop changes nothing but that trajectories which wait are cancelled.
+        the stop's distance farther, is followed to its end at its own speed. If any other one ends before, the stop's
+        reference ends with it. A stop within a stop only cancels trajectories that wait.
 
         Parameters
         ----------
@@ -546,12 +546,13 @@ class ReferenceGenerator:
         deceleration : float or (n,) array_like
             D, greater than 0 [rad/s^2].
         given : bool or (n,) array_like of bool
-            Whether D was asked for, or is what the joint could do.
+            Whether D was requested; otherwise it is what the joint could do.
 
         Raises
         ------
         TrajectoryError
-            If there is no state yet, a deceleration is not finite and above 0, or it takes more than `MAX_BRAKING`.
+            If there is no state yet, a deceleration is not finite and above 0, or the stop takes more than
+            `MAX_BRAKING`.
         """
         if self._last_ns is None:
             raise TrajectoryError("no state yet", hint="there is no reference to stop")
@@ -572,7 +573,7 @@ class ReferenceGenerator:
         self._last_ns = max(self._last_ns, stamp_ns)
 
     def _fading(self, effort, stamp_ns):
-        """A path at rest in the scratch state, on which an effort goes."""
+        """A path at rest in the scratch state, on which an effort fades."""
         time_ns = round(max(self._period, MIN_RAMP) * SECOND)
         path = Path([time_ns], [self._scratch[:1].copy()])
         path.begin(stamp_ns, self._scratch, effort)
@@ -588,7 +589,7 @@ class ReferenceGenerator:
 
 
 def rest_of(trajectory, now_ns, least):
-    """The points of a trajectory that lie at least a time ahead, or the last one, as one that starts now.
+    """The points of a trajectory at least a time ahead, or the last one, as a trajectory that starts now.
 
     Parameters
     ----------
@@ -644,7 +645,7 @@ def _straight(position, velocity, deceleration, stamp_ns, shortest, joint_names)
 
 
 def _limits(path, deceleration, given, period):
-    """What a stop keeps to: bounds (n,) of slowing down, acceleration [rad/s^2] and jerk [rad/s^3]; least time [s]."""
+    """Limits of a stop: bounds (n,) of slowing down, acceleration [rad/s^2] and jerk [rad/s^3]; minimum time [s]."""
     speed, acceleration, jerk = path.peaks()
     slow = SLOW_FRACTION * deceleration
     # How fast the motion itself changes.
@@ -663,7 +664,7 @@ def _limits(path, deceleration, given, period):
 
 
 def _stopped(path, stamp_ns, duration_ns):
-    """The path of a stop from a stamp on, which takes a time, both in [ns]; see module `path`."""
+    """The path of a stop from a stamp on, with a duration, both in [ns]; see module `path`."""
     slowed = SlowedPath(path, stamp_ns, duration_ns)
     left_ns = path.start_ns + path.duration_ns - stamp_ns
     if path.scaled or left_ns > duration_ns or not path.ends_smoothly:
@@ -678,7 +679,7 @@ def _stopped(path, stamp_ns, duration_ns):
 
 
 def _braking_time(path, stamp_ns, limits, shortest):
-    """Time of a stop from a stamp on [ns], as `ReferenceGenerator.stop` says."""
+    """Time of a stop from a stamp on [ns], as in `ReferenceGenerator.stop`."""
     begin, rate = max(path.elapsed(stamp_ns), 0.0), path.rate(stamp_ns)
     rates = np.array([rate, rate**2, rate**3])[:, None, None]
 

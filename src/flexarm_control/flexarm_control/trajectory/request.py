@@ -41,7 +41,7 @@ class JointTrajectoryData:
     accelerations: np.ndarray | None = None  # (k, n) [rad/s^2]; None: cubic interpolation at most
     effort: np.ndarray | None = None  # (k, n) [N m], added to the torque; None: none
     coast: Coast | None = None  # how it comes to rest after a last point that moves
-    first: np.ndarray | None = None  # position at time 0, (n,) [rad], of which no point is left
+    first: np.ndarray | None = None  # position at time 0, (n,) [rad], if no point there is left
 
     @property
     def times(self) -> np.ndarray:
@@ -97,14 +97,14 @@ def validate(
         Limit of the speeds in the arm's order [rad/s]. It applies to the given velocities and to
         the mean speed between two points, which no curve through both can stay below.
     held : (n,) array_like, optional
-        Where the joints are that the message may leave out: they stay there [rad]. Not given: it may leave out none.
+        Where joints stay that the message leaves out [rad]; if not given, it may leave out none.
     streaming : Streaming
-        Whether the end may move, how near positions are smoothed, and what becomes of effort.
+        Whether the end may move, how near positions are smoothed, and how effort is treated.
 
     Raises
     ------
     TrajectoryError
-        With the point, field and joint, the value, the limit, and what to do.
+        It names the point, field and joint, the value, the limit, and what to do.
     """
     arm_joint_names = tuple(arm_joint_names)
     order = _column_order(joint_names, arm_joint_names, held is not None)
@@ -139,7 +139,7 @@ def validate(
 
 
 def _effort(column, arm_joint_names, order, treatment):
-    """Effort of all points, (k, n) [N m], if it is added; it is refused here otherwise, or left out: None."""
+    """Effort of all points, (k, n) [N m], if it is added; otherwise it is refused, or left out (None)."""
     if treatment == ADD:
         return _field("effort", column, arm_joint_names, order, None)
     filled = np.flatnonzero(_lengths("effort", column))
@@ -153,7 +153,7 @@ def _effort(column, arm_joint_names, order, treatment):
 
 
 def _smoothed(trajectory, streaming):
-    """A trajectory of positions alone, smoothed as `streaming` asks for where they are near."""
+    """A trajectory of positions alone, smoothed as `streaming` requires if they are near."""
     if not streaming.smoothing or not are_near(trajectory.times_ns, streaming.smoothing):
         return trajectory
     times_ns, fields = smoothed(trajectory.times_ns, trajectory.positions, streaming.window)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Speed scaling: a factor on the time of a trajectory, that changes smoothly.
+r"""Speed scaling: a factor on the time of a trajectory, which changes smoothly.
 
 The reference is :math:`q_r(s(t))`, as in a stop (module `path`), with
 
 .. math:: \dot s = f_0 + \sum_i \Delta f_i\, S\!\left(\frac{t - t_i}{T_i}\right)
 
-for changes of the factor by :math:`\Delta f_i`, each in a ramp S of its own. Velocity and acceleration are
-:math:`q_r'\dot s` and :math:`q_r''\dot s^2 + q_r'\ddot s`, and a torque that is computed from them belongs to the
-motion as it is then. With f = 0 the arm rests where it is on its way.
+for changes of the factor by :math:`\Delta f_i`, each with its own ramp S. Velocity and acceleration are
+:math:`q_r'\dot s` and :math:`q_r''\dot s^2 + q_r'\ddot s`. So a torque that is computed from them belongs to the
+scaled motion. With f = 0 the arm rests where it is on its way.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from .values import SECOND
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """Time of a path over that of the arm: s, with its rate, from an origin on.
+    """Time s of a path as a function of the arm's time, with its rate, from an origin on.
 
     Attributes
     ----------
@@ -56,12 +56,12 @@ class TimeLaw:
         return self.level + sum(step for *_, step in self.ramps)
 
     def changed(self, stamp_ns, factor, duration):
-        """Return one that goes over to a factor [-] from a stamp [ns] on, within a duration [s]."""
+        """Return a law that changes to a factor [-] from a stamp [ns] on, within a duration [s]."""
         law = self.since(stamp_ns, self.at(stamp_ns)[0])
         return replace(law, ramps=(*law.ramps, (stamp_ns, duration, factor - self.factor)))
 
     def since(self, stamp_ns, covered=0.0):
-        """Return one with the same rate, from another origin on."""
+        """Return a law with the same rate, from another origin on."""
         over = [r for r in self.ramps if r[0] + r[1] * SECOND <= stamp_ns]
         left = tuple(r for r in self.ramps if r not in over)
         return TimeLaw(stamp_ns, covered, self.level + sum(step for *_, step in over), left)
@@ -84,11 +84,11 @@ class ScaledPath:
     Parameters
     ----------
     path : Path
-        Begun, and not changed any more.
+        A path that has begun and is not changed any more.
     law : TimeLaw
     """
 
-    #: Whether the way's time is not that of the arm.
+    #: Whether the path's time differs from the arm's.
     scaled = True
 
     def __init__(self, path, law):
@@ -111,7 +111,7 @@ class ScaledPath:
         return self.followed.derivatives(elapsed)
 
     def elapsed(self, stamp_ns):
-        """Time of the path that a stamp stands for, from the path's start [s]."""
+        """Time of the path at a stamp, from the path's start [s]."""
         return self.law.at(stamp_ns)[0]
 
     def pace(self, stamp_ns):
@@ -125,7 +125,7 @@ class ScaledPath:
         return max(self.law.at(stamp_ns)[1], law.level + sum(steps))
 
     def _place(self, s):
-        """Stamp of the path, and what is left to it [s], at a time s of the path [s]."""
+        """Stamp of the path, and remainder [s], at a time s of the path [s]."""
         whole = int(s * SECOND)
         return self.start_ns + whole, s - whole / SECOND
 
@@ -149,7 +149,7 @@ class ScaledPath:
     def near(self, stamp_ns, offset, out):
         """Fill `out` (3, n) with the state `offset` [s] from `stamp_ns`, on the path's polynomial at that stamp.
 
-        Whether the stamp is before the end; after it the state is that of the end, at any offset.
+        Returns whether the stamp is before the end. After it the state is that of the end, at any offset.
         """
         s, rate, change = self.law.at(stamp_ns)
         place, rest = self._place(s)

@@ -61,7 +61,7 @@ def load(text, model, start=None) -> JointTrajectoryData:
         A path that ends as `files.SUFFIXES`, or what `from_spec` takes.
     model : ArmModel
     start : (n,) array_like, optional
-        Where a written motion starts [rad]; zero if not given.
+        Joint angles at which a written motion starts [rad]; zero if not given.
     """
     if Path(text).suffix.lower() in files.SUFFIXES:
         return files.read(text, model.joint_names, *limits(model))
@@ -82,7 +82,7 @@ def from_spec(text, model, start=None) -> JointTrajectoryData:
     Raises
     ------
     TrajectoryError
-        With the family or setting, and its value.
+        It names the family or setting, and its value.
     FlexarmError
         As the families raise it.
     """
@@ -93,7 +93,7 @@ def from_spec(text, model, start=None) -> JointTrajectoryData:
 
 
 def sampled(profile, model, points=POINTS) -> JointTrajectoryData:
-    """Return a motion as a trajectory of so many points, checked against the arm's limits."""
+    """Return a motion as a trajectory with this number of points, checked against the arm's limits."""
     if not 2 <= points <= MAX_POINTS:
         raise TrajectoryError("is out of range", field="points", value=points, limit=POINTS_RANGE)
     names, rows = model.joint_names, profiles.rows(profiles.sample(profile, points))
@@ -162,7 +162,7 @@ def motion(family, settings, model, start):
     Raises
     ------
     TrajectoryError
-        With the setting and its value.
+        It names the setting and its value.
     FlexarmError
         As the family raises it.
     """
@@ -238,7 +238,7 @@ def _number(kind, settings, key, default):
 
 
 def _numbers(text, count, name, what, spread=True):
-    """Read so many finite numbers, (count,); with `spread` one number stands for all."""
+    """Read `count` finite numbers, (count,); with `spread` one number stands for all."""
     hint = f"give {count} finite {what}"
     semicolons = f"{hint}, separated by semicolons"
     values = [_read(float, word, name, "is not a number", semicolons) for word in text.split(";")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Streams of points: ends that move, and near positions that are smoothed.
+r"""Streams of points: trajectories whose end moves, and near positions that are smoothed.
 
 A stream, as of MoveIt Servo or of teleoperation, sends its next point before the last one is reached. Such a point may
 have a velocity. If no other point comes, the motion goes on for the time C (`cmd_timeout`) and comes to rest in B:
@@ -8,17 +8,17 @@ have a velocity. If no other point comes, the motion goes on for the time C (`cm
     \dot q &= v + a t (1 - t/C)^2, && 0 \le t \le C, \\
     \dot q &= v\,(1 - 10x^3 + 15x^4 - 6x^5) + a' B x (1 - x)^3, && x = (t - C)/B,
 
-from velocity v and acceleration a of the last point; a' = 0 after the first part, and a without it. Velocity and
-acceleration have no step, and the jerk none at the end.
+where v and a are the velocity and acceleration of the last point; a' = 0 after the first part, and a without it.
+Velocity and acceleration have no step, and the jerk has none at the end.
 
-Positions alone are joined by straight lines, whose velocity steps at each point. Where points are nearer than a window
-W to each other, the straight lines L are smoothed by a triangle of that width,
+Positions alone are joined by straight lines, whose velocity steps at each point. If points are nearer to each other
+than a window W, the straight lines L are smoothed by a triangle of that width,
 
 .. math:: q(t) = \frac{F(t + W/2) - 2F(t) + F(t - W/2)}{(W/2)^2}, \qquad F'' = L,
 
-with its velocity and acceleration, the same differences of F' and of L. The end is reached, at rest, W/2 later. A
-single point is reached at rest after W, if its time is shorter: sent again and again it makes a filter of third order.
-W is at least half a period of the lowest bending mode.
+Its velocity and acceleration are the same differences of F' and of L. The motion reaches the end, at rest, W/2 later. A
+single point is reached at rest after W, if its time is shorter; sent again and again, it acts as a filter of third
+order. W is at least half a period of the lowest bending mode.
 """
 
 from dataclasses import dataclass
@@ -33,32 +33,32 @@ from .values import BRAKING_STEP, SECOND
 REFUSE, IGNORE, ADD = "refuse", "ignore", "add"
 PARAMETERS = (
     parameter("allow_nonzero_velocity_at_trajectory_end", False).described(
-        "Whether the last point of a trajectory may have a velocity, as in a stream: the motion goes on for"
-        " cmd_timeout, and comes to rest smoothly if nothing else has come by then."
+        "Whether the last point of a trajectory may have a velocity, as in a stream. The motion then goes on for"
+        " cmd_timeout, and comes to rest smoothly if nothing else has arrived by then."
     ),
     parameter("cmd_timeout", 0.1, "s", 0.0, 3600.0).described(
         "How long a motion goes on after a last point with a velocity. 0.0: it comes to rest from that point on."
     ),
     parameter("smoothing_time", 0.1, "s", 0.0, 10.0).described(
-        "Positions alone that are nearer to each other than this are smoothed over this time, and at least half a"
-        " period of the lowest bending mode. 0.0: straight lines, whose velocity steps at each point."
+        "Points with positions alone that are nearer to each other than this are smoothed over this time, and at least"
+        " half a period of the lowest bending mode. 0.0: straight lines, whose velocity steps at each point."
     ),
     parameter("effort_in_points", REFUSE, choices=(REFUSE, IGNORE, ADD)).described(
-        "What becomes of effort in points: refuse; ignore; add: it is added to the torque, which has all that the arm's"
-        " model says already."
+        "Treatment of effort in points: refuse; ignore; add: it is added to the torque, which already contains"
+        " everything that the arm's model gives."
     ),
 )
-#: Largest slope of the brake's velocity over its mean one [-].
+#: Ratio of the largest slope of the brake's velocity to its mean one [-].
 BRAKE_SLOPE = 15.0 / 8.0
-#: The brake takes at least so many periods of the lowest bending mode.
+#: Minimum duration of the brake, in periods of the lowest bending mode.
 BRAKE_PERIODS = 1.2
-#: The window of smoothing has at least so many of them.
+#: Minimum window of smoothing, in the same periods.
 SMOOTH_PERIODS = 0.5
 
 
 @dataclass(frozen=True)
 class Streaming:
-    """How points of streams are taken; by default as any other ones, and effort is refused.
+    """How points of streams are taken; by default like any other points, and effort is refused.
 
     Attributes
     ----------
@@ -67,9 +67,9 @@ class Streaming:
     timeout : float
         C [s]
     deceleration : float or ndarray, shape (n,)
-        Largest in the brake [rad/s^2].
+        Largest deceleration in the brake [rad/s^2].
     period : float
-        Of the lowest bending mode [s].
+        Period of the lowest bending mode [s].
     smoothing : float
         Points that are nearer to each other are smoothed [s]; 0: none.
     effort : str
@@ -85,7 +85,7 @@ class Streaming:
 
     @property
     def window(self):
-        """W [s]: a slow manifold along a faster motion would not hold."""
+        """W [s]; a slow manifold along a faster motion would not hold."""
         return max(self.smoothing, SMOOTH_PERIODS * self.period)
 
     def coast(self, velocity):
@@ -95,13 +95,13 @@ class Streaming:
         return Coast(round(self.timeout * SECOND), round(brake * SECOND))
 
 
-#: As a joint_trajectory_controller takes points by default, but for effort.
+#: As a joint_trajectory_controller takes points by default, except for effort.
 PLAIN = Streaming()
 
 
 @dataclass(frozen=True)
 class Coast:
-    """How a motion ends whose last point moves: it goes on, and comes to rest [ns]."""
+    """The end of a motion whose last point moves: it goes on, and comes to rest [ns]."""
 
     going_on_ns: int
     brake_ns: int
@@ -148,7 +148,7 @@ def smoothed(times_ns, positions, window):
     Parameters
     ----------
     times_ns : ndarray of int, shape (k,)
-        From the start [ns].
+        Times of the points from the start [ns].
     positions : ndarray, shape (k, n)
         [rad]
     window : float
@@ -157,7 +157,7 @@ def smoothed(times_ns, positions, window):
     Returns
     -------
     times_ns : ndarray of int, shape (l,)
-        The last one is later, those within W of the start are left out.
+        Times of the result: the last one is later, and those within W of the start are left out.
     fields : list of 3 ndarrays, shape (l, n)
         Positions, velocities and accelerations; at rest at the end.
     """
@@ -177,7 +177,7 @@ def smoothed(times_ns, positions, window):
 
 
 def _line(times, positions, beyond):
-    """Straight lines between points; before the first the first line goes on, after the last the end is held."""
+    """Straight lines between points; the first line goes on before the first point, and the end is held after it."""
     slope = (positions[1] - positions[0]) / (times[1] - times[0])
     times = np.concatenate([[times[0] - beyond], times, [times[-1] + beyond]])
     positions = np.vstack([positions[0] - beyond * slope, positions, positions[-1]])

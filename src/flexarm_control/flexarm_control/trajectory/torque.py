@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The torque that a trajectory needs: refuses one that the joints do not have.
+r"""Computes the torque that a trajectory needs, and refuses a trajectory that needs more than the joints have.
 
-Judged is the slow subsystem (10), the rigid arm with weight and friction, and the payload of the arm file:
+The torque is that of the slow subsystem (10), the rigid arm with weight, friction and the payload of the arm file:
 
 .. math:: \bar u(t) = B^{-1}(q_r, \dot q_r)\,[\ddot q_r - a(q_r, \dot q_r)] .
 
-It is taken at places of every polynomial, at its ends from inside, and for the hold after the last point. Steps of the
-velocity, as between positions alone, have no finite torque; they are left to the tracking, and the rest is judged.
-What the bending adds is left to the fast control.
+It is evaluated at places of every polynomial, at its ends from inside, and for the hold after the last point. Steps of
+the velocity, as between positions alone, have no finite torque. They are left to the tracking, and the rest is judged.
+Torque for the bending is left to the fast control.
 """
 
 import numpy as np
@@ -18,9 +18,9 @@ from flexarm_dynamics.singular_perturbation import slow_torque
 from .path import Path
 from .values import SECOND, TORQUE_ROUNDING
 
-#: Places per polynomial: a peak between them is right to half a percent with the most.
+#: Number of places per polynomial; with the maximum, a peak between them is right to half a percent.
 MIN_PLACES, MAX_PLACES = 2, 33
-#: About so many places in all, as long as there are so few polynomials; and at most so many.
+#: Approximate number of places in all, as long as there are few polynomials; and maximum number.
 PLACES, MOST = 400, 2000
 
 
@@ -43,14 +43,14 @@ def refuse_torque(model, trajectory, start, limit):
     model : ArmModel
     trajectory : JointTrajectoryData
     start : ndarray, shape (3, n), or None
-        State of the reference that it starts from; None: unknown, its first polynomial is not judged.
+        State of the reference that it starts from; None: unknown, and the first polynomial is not judged.
     limit : ndarray, shape (n,)
         [N m]; infinite where there is none.
 
     Raises
     ------
     TrajectoryError
-        At the place that lacks the most, with joint, time, torque and limit.
+        It names the place with the largest excess, with joint, time, torque and limit.
     """
     if np.isinf(limit).all():
         return
@@ -109,7 +109,7 @@ def _places(path, from_start):
 
 
 def _hint(model, state, needed, limit):
-    """What to do: slower, as long as the arm can be held there; torques of a motion fall with its time squared."""
+    """What to do: slower, if the arm can be held there; torques of a motion fall with its time squared."""
     still = required_torque(model, (state * [[1.0], [0.0], [0.0]])[None])[0]
     if not (np.abs(still) < limit).all():
         return "the arm can't be held there: choose other positions"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arm files: YAML, validated; every error names its field by its path, as ``links[0].length``.
+"""Reads arm files (YAML) and validates them; every error names its field by its path, such as ``links[0].length``.
 
 A file gives an `Arm` or an `ArmFileError`, never half an arm.
 """
@@ -38,13 +38,13 @@ from .description import (
 from .entries import MAX_NUMBER, Section, kind_of, read_yaml, value_error
 
 JOINT_TYPES = ("revolute", "fixed")
-#: Most parts of a link with sections of their own.
+#: Max. number of parts of a link that has `sections`.
 MAX_SECTIONS = 40
 #: Largest resolution of a gauge's bridge [bit].
 MAX_BITS = 32
 #: Largest play of a transmission [rad].
 MAX_PLAY = 0.2
-#: Largest part of the transmitted torque that is friction: beyond, a gear locks itself [-].
+#: Largest fraction of the transmitted torque that may be friction; beyond this a gear is self-locking [-].
 MAX_LOAD_FRICTION = 0.9
 #: Largest full scale of a gauge [-].
 MAX_STRAIN = 0.1
@@ -219,7 +219,7 @@ def _flexibility(s):
 
 #: Keys of a link's or a part's stiffnesses, in the order of `BEAM_DIRECTIONS`.
 STIFFNESS_KEYS = ("EI_y", "EI_z", "GJ")
-#: What a part of a link has from the part before it unless it states its own.
+#: Keys that a part of a link inherits from the part before it, unless it states its own.
 INHERITED = ("shape", "density", "youngs_modulus", "shear_modulus")
 #: Where the properties of a tapered section are computed, from one end to the other [-].
 _TAPER = 0.5 - 0.5 * np.cos(np.pi * np.arange(9) / 8.0)
@@ -296,7 +296,7 @@ def _rectangle(b, h):
 
 
 def _tube(outer, wall):
-    """The same of a tube."""
+    """Area, second moments and torsion constant of a tube."""
     inner = outer - 2.0 * wall
     area = math.pi * (outer**2 - inner**2) / 4.0
     second = math.pi * (outer**4 - inner**4) / 64.0
@@ -369,7 +369,7 @@ def _parts(s, length):
 
 
 def _pieces(parts, length):
-    """Reference numbers of a link, and its `Piece`s: none of a uniform link."""
+    """Reference values of a link, and its `Piece`s; a uniform link has none."""
     first = parts[0][1]
     stiffness = {d: c[0] for d, c in first.stiffness.items()}
     if len(parts) == 1 and all(
@@ -484,7 +484,7 @@ def _body(s, length):
 
 
 def _tensor(s, key):
-    """An inertia as rows: from one number for every axis, or xx, yy, zz, xy, xz, yz; zero where it is not given."""
+    """Rows of an inertia, given as one number for every axis or as xx, yy, zz, xy, xz, yz; zero if it is not given."""
     inertia = np.zeros((3, 3))
     if s.has(key):
         if isinstance(s.raw(key), list):
@@ -527,7 +527,7 @@ def _gauge(s, links):
 
 
 def _gauge_place(s, link):
-    """Where a gauge is: on a beam its place and direction; else a point that the archive names."""
+    """Place of a gauge: on a beam its position and direction, otherwise a point that the archive names."""
     if link.reduced is None:
         return {
             "position": s.number("position", "length"),
@@ -543,7 +543,7 @@ def _gauge_place(s, link):
 
 
 def _check_gauge(s, gauge, length):
-    """Refuse a gauge that its link of this length can't carry, or that sees nothing."""
+    """Refuse a gauge that does not fit on its link of this length, or that can't measure anything."""
     scale, near = gauge.full_scale, 0.5 * length
     for key, fits, problem, limit, hint in (
         ("position", 0.0 <= gauge.position <= length, f"m is outside {gauge.link}", f"0 to {length:.6g} m", ""),
@@ -607,7 +607,7 @@ def _observed(s, modes, gauges):
                 f"{seen_by} on {key[0]} in direction {key[1]} for {wanted} observed modes",
                 hint="add gauges or list fewer observed_modes",
             )
-    # The order of the modal coordinates is the arm's, whatever the file's.
+    # The modal coordinates keep the arm's order, whatever the order in the file.
     return tuple(m.name for m in modes if m.name in names)
 
 
@@ -619,9 +619,9 @@ def parse(text, where="arm", folder=None):
     text : str
         The file's content.
     where : str
-        What to call it in messages about the YAML itself.
+        Its name in messages about the YAML itself.
     folder : Path, optional
-        Where files that it names are looked for; the working directory if not given.
+        Folder of the files that the text names; the working directory if not given.
 
     Returns
     -------
@@ -695,7 +695,7 @@ def _model(top):
 
 
 def arms_directories():
-    """Where shipped arms are looked for: the source tree first, then what colcon installed."""
+    """Folders that are searched for shipped arms: the source tree first, then what colcon installed."""
     here = Path(__file__).resolve()
     places = [parent / "config" / "arms" for parent in here.parents]
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):

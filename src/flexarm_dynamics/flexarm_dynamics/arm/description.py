@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm is: plain data in SI, as `arm_file.load` reads it.
+"""Describes an arm as plain data in SI units, as `arm_file.load` reads it.
 
 Frames: each joint's frame is the tip frame of the previous link (the base frame for the first joint) moved by
 the joint's fixed `origin` and turned by the joint angle about `axis`. A link extends along the x axis of its
@@ -17,12 +17,12 @@ from ..errors import ModelError
 from .reduced import DIRECTION as REDUCED
 from .reduced import Reduced
 
-#: Ways in which a beam is flexible, and all of them: links given by reduced matrices have one of their own.
+#: Directions in which a beam is flexible, and all directions: links given by reduced matrices have one of their own.
 BEAM_DIRECTIONS = ("y", "z", "twist")
 DIRECTIONS = (*BEAM_DIRECTIONS, REDUCED)
 ENCODERS = ("motor", "link")
 SAFE_ACTIONS = ("brake", "damp", "zero")
-#: At most this many modes per direction: beyond, a slender beam is no longer the model to use.
+#: Max. number of modes per direction; with more, a slender beam is no longer the right model.
 MAX_MODES = 20
 SHAPES = ("clamped_free", "loaded", "from_frequencies")
 
@@ -33,21 +33,21 @@ class Friction:
 
     .. math:: f_v\dot q + \bigl(f_c + (f_b - f_c)e^{-(\dot q/v_s)^2} + c\,|\tau|\bigr)\tanh(\dot q/v_0)
 
-    with the torque tau that the transmission transmits. Breakaway below Coulomb's level counts for nothing.
+    with the torque tau that the transmission transmits. A breakaway level below the Coulomb level has no effect.
     """
 
     viscous: float = 0.0  # [N m s/rad] f_v
     coulomb: float = 0.0  # [N m] f_c
     smoothing: float = 0.01  # [rad/s] v_0: speed at which Coulomb friction reaches 76 %
     breakaway: float = 0.0  # [N m] f_b: level at rest
-    stribeck: float = 0.1  # [rad/s] v_s: speed at which 37 % of its excess over Coulomb's is left
+    stribeck: float = 0.1  # [rad/s] v_s: speed at which 37 % of the excess over Coulomb is left
     load: float = (
-        0.0  # [-] c: part of the transmitted torque that is friction; only with a transmission
+        0.0  # [-] c: fraction of the transmitted torque that is friction; only with a transmission
     )
 
     @property
     def excess(self):
-        """Of the breakaway level over Coulomb's [N m]."""
+        """Excess of the breakaway level over the Coulomb level [N m]."""
         return max(self.breakaway - self.coulomb, 0.0)
 
 
@@ -55,23 +55,24 @@ class Friction:
 class Transmission:
     r"""Gear, belt or shaft between a joint's motor and its link: a spring and a damper behind play.
 
-    The joint's coordinate q is then the motor's angle (seen through the gear), on which torque and friction act;
-    :math:`\gamma`, the link's angle less the motor's, is one of the modal coordinates. From link to motor goes
+    The joint's coordinate q is then the motor's angle (seen through the gear). Torque and friction act on it.
+    :math:`\gamma`, the link's angle minus the motor's, is one of the modal coordinates. The torque from link to motor
+    is
 
     .. math::
         \tau = k\,s + (e\,d + (1 - e)\,d_0 + c\,|k\,s|)\,\dot\gamma, \qquad
         s = \gamma - \tfrac12\sqrt{(\gamma + \tfrac b2)^2 + w^2} + \tfrac12\sqrt{(\gamma - \tfrac b2)^2 + w^2}, \qquad
         e = \frac{s^2}{s^2 + (b/20 + w)^2} \ (1 \text{ without play}).
 
-    With sharp corners, w = 0, s is what the deflection exceeds the play by, and within it nothing but the damping
-    d_0 of its grease is transmitted. The flanks of a real gear meet gradually: w is half the way over which they do.
-    The damper d takes hold gradually as the flanks are pressed, so that the torque has no jump; c is damping that
+    With sharp corners (w = 0), s is the part of the deflection beyond the play. Within the play, only the damping d_0
+    of the grease transmits torque. The flanks of a real gear meet gradually: w is half the angle over which they do.
+    The damper d takes effect gradually as the flanks are pressed together, so the torque has no jump. c is damping that
     grows with the transmitted torque (Hunt & Crossley 1975).
     """
 
     stiffness: float  # [N m/rad] k
     damping: float = 0.0  # [N m s/rad] d
-    play: float = 0.0  # [rad] b: the whole way that the link moves freely while the motor is held
+    play: float = 0.0  # [rad] b: angle by which the link moves freely while the motor is held
     load_damping: float = 0.0  # [s/rad] c
     rounding: float = 0.0  # [rad] w
     play_damping: float = 0.0  # [N m s/rad] d_0
@@ -79,7 +80,7 @@ class Transmission:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a joint may do; infinite where the file says nothing."""
+    """Limits of a joint; infinite if the file has none."""
 
     position: tuple = (-np.inf, np.inf)  # [rad] low, high
     velocity: float = np.inf  # [rad/s]
@@ -109,23 +110,23 @@ class Joint:
     safe_action: str = "damp"
     brake_torque: float | None = None  # [N m] holding capacity; None: the torque limit
     damp_coefficient: float | None = None  # [N m s/rad], without a bound; None: a bounded torque
-    damp_torque: float | None = None  # [N m] largest of damp; None: from limits, gauges and weight
+    damp_torque: float | None = None  # [N m] limit of damp; None: from limits, gauges and weight
     damp_time: float | None = None  # [s] of its soft start; None: half a period, at most 0.25
     encoder_counts: int = 0  # [-] per turn of the joint; 0: not quantised
     encoder: str = (
         "motor"  # what it measures: the motor's angle, or the link's behind the transmission
     )
     transmission: Transmission | None = None  # None: the link is fixed to the motor
-    continuous: bool = False  # turns without an end: a trajectory takes the short way
+    continuous: bool = False  # turns without end: a trajectory takes the shorter way
 
     @property
     def housed(self):
-        """Whether its motor's housing has an inertia."""
+        """Whether the motor's housing has an inertia."""
         return any(map(any, self.housing_inertia))
 
     @property
     def inertia(self):
-        """Hub inertia with the rotor's seen through the gear [kg m^2]."""
+        """Hub inertia plus the rotor's inertia seen through the gear [kg m^2]."""
         return self.hub_inertia + self.rotor_inertia * self.gear_ratio**2
 
 
@@ -143,8 +144,8 @@ class Flexibility:
 class Piece:
     r"""A part of a link over which its section changes gradually, or not at all.
 
-    Each property is a polynomial in :math:`t = (\xi - start)/(end - start)`, lowest power first, in units of the
-    link's own number: its mass per length, stiffnesses and polar inertia per length.
+    Each property is a polynomial in :math:`t = (\xi - start)/(end - start)`, lowest power first, relative to the link's
+    own value (mass per length, stiffness or polar inertia per length).
     """
 
     start: float  # [-] xi at its end towards the base
@@ -168,7 +169,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Link:
-    """A link along x; rigid where `flexible` says nothing, uniform where it has no `pieces`."""
+    """A link along x; rigid in directions that `flexible` does not have, uniform if it has no `pieces`."""
 
     name: str
     length: float  # [m]
@@ -180,17 +181,17 @@ class Link:
     pieces: tuple = ()  # Piece, from base to tip, without gaps
     bodies: tuple = ()  # Body
     root: tuple = (0.0, 0.0, 0.0)  # [m] of its base, from the joint
-    reduced: Reduced | None = None  # its matrices, where it is no beam
+    reduced: Reduced | None = None  # its matrices, if it is not a beam
 
     @property
     def tip(self):
-        """Where its undeformed tip is, from its base, (3,) [m]."""
+        """Position of its undeformed tip relative to its base, (3,) [m]."""
         if self.reduced is not None:
             return self.reduced["tip"]
         return np.array([self.length, 0.0, 0.0])
 
     def available(self, count):
-        """A number of modes, or as many as its matrices have."""
+        """The number of modes `count`, or as many as its matrices have, if fewer."""
         return count if self.reduced is None else min(count, self.reduced.modes)
 
     @property
@@ -205,18 +206,18 @@ class Link:
 
     @property
     def total_mass(self):
-        """Mass of the beam and of what sits on it [kg]."""
+        """Mass of the beam and of the bodies on it [kg]."""
         return self.mass + sum(body.mass for body in self.bodies)
 
     @property
     def breaks(self):
-        """Places where the section jumps or a body sits, with both ends: from 0 to 1 [-]."""
+        """Places where the section jumps or a body sits, and both ends, from 0 to 1 [-]."""
         places = {piece.end for piece in self.pieces}
         places |= {body.position / self.length for body in self.bodies}
         return tuple(sorted({0.0, *places, 1.0}))
 
     def factor(self, name, xi):
-        """A property along the link, in units of the link's own number; where it jumps, the value towards the base.
+        """A property along the link, relative to the link's own value; where it jumps, the value on the base's side.
 
         Parameters
         ----------
@@ -302,15 +303,15 @@ class Gauge:
     """A strain gauge, or the bridge it stands for.
 
     The strain read is ``gain * (-c y''(eta)) + bias + drift + noise`` for bending along y or z, with the
-    curvature ``y''`` at `position` and `surface_distance` c, and ``gain * c theta'(eta) + ...`` for twist; it is
-    rounded to the bridge's steps and ends at the ends of its range.
+    curvature ``y''`` at `position` and `surface_distance` c, and ``gain * c theta'(eta) + ...`` for twist. The reading
+    is rounded to the bridge's steps and clipped to its range.
     """
 
     name: str
     link: str
     position: float  # [m] from the link's base
     direction: str
-    surface_distance: float  # [m] from the neutral axis; its sign is the face's
+    surface_distance: float  # [m] from the neutral axis; its sign tells the face
     gain: float = 1.0  # [-]
     bias: float = 0.0  # [-] strain
     noise: float = 0.0  # [-] rms strain
@@ -331,7 +332,7 @@ class Gauge:
 
     @property
     def uncertainty(self):
-        """Rms error of one reading [-]: its noise, and rounding's step / sqrt(12)."""
+        """Rms error of one reading [-]: its noise and the error of rounding, step / sqrt(12)."""
         return float(np.hypot(self.noise, self.step / np.sqrt(12.0)))
 
 
@@ -341,7 +342,7 @@ TRANSMISSION = "transmission"
 
 @dataclass(frozen=True)
 class Mode:
-    """Where a modal coordinate stands: which link (of a transmission: joint), direction and number (from 1)."""
+    """What a modal coordinate describes: its link (for a transmission: its joint), direction and number (from 1)."""
 
     link: str
     direction: str
@@ -373,14 +374,14 @@ class Arm:
     description: str = ""
     source: str = ""
     simplifies: "Arm | None" = (
-        None  # the arm of which this one is what a controller knows, see `known`
+        None  # the actual arm, if this one is what a controller knows of it, see `known`
     )
 
     @property
     def known(self):
-        """The arm as observer and controller know it: its links fixed to the motors.
+        """The arm as observer and controller know it: with its links fixed to the motors.
 
-        No sensor measures the deflection of a transmission, so that it is none of their states.
+        No sensor measures the deflection of a transmission, so it is not one of their states.
         """
         if all(j.transmission is None for j in self.joints):
             return self
@@ -389,7 +390,7 @@ class Arm:
 
     @property
     def whole(self):
-        """The arm itself, transmissions and all, also of one that is `known`."""
+        """The actual arm with its transmissions, also if this one is what is `known` of it."""
         return self if self.simplifies is None else self.simplifies
 
     @property
@@ -464,14 +465,14 @@ class Arm:
 
     @property
     def most_modes(self):
-        """The most modes that it has in any direction of any link; 0 for a rigid one."""
+        """Largest number of modes in any direction of any link; 0 for a rigid arm."""
         return max((f.modes for link in self.links for f in link.flexible.values()), default=0)
 
     def with_modes(self, count):
         """The same arm with `count` modes in every flexible direction of every link.
 
-        Gauges and observed modes stay as they are: what a plant with more modes than its controller knows
-        does to the gauges is spill-over.
+        Gauges and observed modes stay as they are. The modes that the controller does not know strain the gauges, too:
+        this is spill-over.
         """
         if self.simplifies is not None:
             return self.simplifies.with_modes(count).known
@@ -502,7 +503,7 @@ class Arm:
         return replace(arm, observed_modes=kept)
 
     def fuller(self, modes, stiffens, finite_slope):
-        """The arm with more modes and more of its kinematics, as far as that can be: see `ArmModel.fuller`."""
+        """The arm with more modes and more of its kinematics, as far as possible; see `ArmModel.fuller`."""
         arm = self
         for count in range(modes, self.most_modes, -1):
             with contextlib.suppress(ModelError):  # fewer frequencies were measured
@@ -515,7 +516,7 @@ class Arm:
 
 
 def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
-    """The same arm with another payload, stiffness or damping: what a controller designed for the first one may meet.
+    """The same arm with another payload, stiffness or damping, as a controller designed for the first one may meet it.
 
     Gauges, observed modes and everything else stay. Where mode shapes depend on the payload (`loaded`), they
     change with it.
@@ -526,8 +527,8 @@ def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
     payload : float
         Factor of the payload's mass and inertia; its offset stays [-].
     stiffness : float
-        Factor of every link's EI and GJ; transmissions stay. Measured frequencies (`from_frequencies`) go with its
-        root, so that their shapes stay as they are [-].
+        Factor of every link's EI and GJ; transmissions stay. Measured frequencies (`from_frequencies`) change by its
+        square root, so their shapes stay as they are [-].
     damping : float
         Factor of every modal damping ratio [-].
 

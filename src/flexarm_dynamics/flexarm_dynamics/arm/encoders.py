@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What encoders read: the angle of a joint's motor, or that of its link behind the transmission."""
+"""Computes what encoders read: the angle of a joint's motor, or of its link behind the transmission."""
 
 import numpy as np
 
 from .description import TRANSMISSION, Mode
 
-#: Rounds that find the motors' angles behind links at given ones: the load changes little within the play.
+#: Iterations that find the motor angles for given link angles; few suffice, as the load changes little within the play.
 REST_ROUNDS = 5
 
 
 def encoder_rows(model):
-    """Rows that make the encoders' readings of (q, delta), and of (qd, delta_d), shape (n, n + m)."""
+    """Matrix from (q, delta) to the encoders' readings, and from (qd, delta_d) to their rates, shape (n, n + m)."""
     n, joints = model.n_joints, model.arm.joints
     rows = np.eye(n, n + model.n_modes)
     for i, joint in enumerate(joints):
@@ -21,7 +21,7 @@ def encoder_rows(model):
 
 
 def motors_at_rest(model, reading):
-    """Motor angles (n,) [rad] with which the arm rests where its encoders have this `reading`, and delta (m,)."""
+    """Motor angles (n,) [rad] and delta (m,) of the arm at rest for which its encoders have this `reading`."""
     motors = np.asarray(reading, float)
     delta = model.static_deflection(motors)
     slack = encoder_rows(model)[:, model.n_joints :]

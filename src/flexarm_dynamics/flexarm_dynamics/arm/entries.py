@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files that people write, read with checks; every error names its entry by its path, as ``links[0].length``.
+"""Reads YAML files that people write, with checks; an error names its entry by its path, such as ``links[0].length``.
 
 PyYAML reads them, and `_check_keys` refuses a key that is given twice. ruamel.yaml refuses one too, but without its
 path, takes three times as long, and reads YAML 1.1 differently: `direction: y` would be `true`, `name: 1e3` a number.
@@ -35,7 +35,7 @@ def read_yaml(text, where):
         reason = getattr(error, "problem", None) or error
         raise ArmFileError(where + line, f"not YAML: {reason}") from None
     except Exception as error:
-        # What PyYAML lets through on a scalar that is not what its tag says, or on endless nesting.
+        # Errors that PyYAML lets through for a scalar that contradicts its tag, and for endless nesting.
         raise ArmFileError(where, f"not YAML: {type(error).__name__}: {error}") from None
 
 
@@ -61,7 +61,7 @@ def _check_keys(node, path, visited):
 
 
 class Section:
-    """A mapping of the file, which knows its path and which of its keys were read.
+    """A mapping in the file; it knows its path and which of its keys were read.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class Section:
         return f"{self.path}.{name}" if self.path else name
 
     def error(self, key, problem, **more):
-        """The error about the field `key`, by its `problem` and `more` of `ArmFileError`."""
+        """The error about the field `key`, with its `problem` and `more` arguments of `ArmFileError`."""
         return ArmFileError(self.at(key), problem, **more)
 
     def has(self, key):
@@ -216,7 +216,7 @@ def kind_of(value):
 
 def _number(value, path):
     if isinstance(value, str):
-        # YAML 1.1 takes 1e-3 (no dot) for text; a person means the number.
+        # YAML 1.1 takes 1e-3 (no dot) for text; the user means the number.
         try:
             value = float(value)
         except ValueError:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixed joints: the links that one holds together become one link before anything is computed.
+"""Removes fixed joints: the two links that a fixed joint holds together become one, before anything is computed.
 
-A rigid link before a fixed joint becomes a body at the root of the link after it, whose axis then begins off its joint.
-A rigid link after one, behind a link that bends, becomes a body at that link's tip, and the joint after it moves along.
+A rigid link before a fixed joint becomes a body at the root of the link after it; the axis of that link then begins off
+its joint. A rigid link after a fixed joint, behind a link that bends, becomes a body at the tip of that link. The next
+joint moves with it.
 """
 
 from dataclasses import replace
@@ -31,7 +32,7 @@ def merged(joints, links, fixed):
     Raises
     ------
     ArmFileError
-        Where two links bend on both sides of a fixed joint, or a rigid one ends the arm behind one that bends.
+        If the links on both sides of a fixed joint bend, or if a rigid link behind a bending one ends the arm.
     """
     if 0 in fixed:
         hint = "turn and move the next joint's origin instead"
@@ -83,7 +84,7 @@ def _pieces(link):
 
 
 def _before(joint, rigid, fixed, link):
-    """The joint and the link that a rigid link with the one fixed to its tip make, in the latter's frame."""
+    """Joint and link that replace a rigid link and the link fixed to its tip, in the frame of the latter."""
     B = _turn(fixed).as_matrix()
     tip = _tip(rigid) + fixed.origin_xyz
     root = B.T @ tip + np.array(link.root)
@@ -101,7 +102,7 @@ def _before(joint, rigid, fixed, link):
 
 
 def _after(link, fixed, rigid, joint):
-    """The link that carries a rigid one at its tip, and the joint at that one's tip."""
+    """The link with a rigid one as bodies at its tip, and the joint moved to the tip of the rigid one."""
     B = _turn(fixed).as_matrix()
     xyz = np.array(fixed.origin_xyz)
     bodies = tuple(

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Links given by reduced matrices, as finite-element programs export them: a NumPy archive of named arrays.
+r"""Reads links given by reduced matrices, which finite-element programs export, from a NumPy archive of named arrays.
 
 A point that is at x in the undeformed link is at :math:`x + \Phi_j(x)\delta_j + \tfrac12\Psi_{jk}(x)\delta_j\delta_k`.
-The shapes :math:`\Phi_j` vanish, with their slopes, at the root; :math:`\Psi_{jk}`, which may be left out, is how the
-link draws back as it bends, and makes the geometric stiffness: under an acceleration a the stiffness gains
-:math:`a\cdot\int\Psi_{jk}dm`, under a force f at the tip :math:`-f\cdot\Psi_{jk}`. All in SI, in the link's frame,
-whose origin is the root; K modes, in any mix (Craig-Bampton, normal, static), which need not be orthogonal.
+The shapes :math:`\Phi_j` vanish, with their slopes, at the root. :math:`\Psi_{jk}` may be left out; it describes how
+the link draws back as it bends, and gives the geometric stiffness: under an acceleration a the stiffness gains
+:math:`a\cdot\int\Psi_{jk}dm`, under a force f at the tip :math:`-f\cdot\Psi_{jk}`. All arrays are in SI and in the
+link's frame, whose origin is the root. The K modes may be of any kind (Craig-Bampton, normal, static) and need not be
+orthogonal.
 
 Shabana (2020), Dynamics of Multibody Systems, 5th ed., ch. 5 (the shape integrals); Craig & Bampton (1968), AIAA
 Journal 6(7).
@@ -22,7 +23,7 @@ from ..errors import ArmFileError
 
 #: Direction of the modes of such a link, as in ``boom_reduced_mode1``.
 DIRECTION = "reduced"
-#: Most modes of an archive, and its largest size [bytes].
+#: Max. number of modes of an archive, and its largest size [bytes].
 MAX_MODES, MAX_BYTES = 60, 64 * 2**20
 #: Arrays by name: shape, and what it is. K modes, P stations, S strains.
 ARRAYS = {
@@ -52,7 +53,7 @@ OPTIONAL = {
     "strain_names": (("S",), "names of points with gauges"),
     "strain": (("S", "K"), "strain there per amplitude"),
 }
-#: Largest asymmetry of the modal matrices, of their largest entry [-].
+#: Largest asymmetry of the modal matrices, relative to their largest entry [-].
 ASYMMETRY = 1e-6
 #: Tip displacement of a mode whose amplitude is one, at most [m]: about that of a beam's modes.
 SCALE = 2.0
@@ -65,9 +66,9 @@ class Reduced:
     Attributes
     ----------
     digest : str
-        Of all arrays: two links of the same digest are equal.
+        Hash of all arrays: two links with the same digest are equal.
     arrays : dict of ndarray
-        By the names of `ARRAYS` and `OPTIONAL`; without those that may be left out and are.
+        By the names of `ARRAYS` and `OPTIONAL`; those of `OPTIONAL` may be missing.
     """
 
     digest: str
@@ -93,13 +94,13 @@ class Reduced:
         return "second_translation" in self.arrays
 
     def get(self, name):
-        """An array, with zeros where it may be left out and is."""
+        """An array by its name; zeros if it is optional and missing."""
         if name in self.arrays:
             return self.arrays[name]
         return np.zeros([self.modes if size == "K" else size for size in OPTIONAL[name][0]])
 
     def loaded(self, mass, moment, inertia, count):
-        """The same in its lowest modes with a rigid body at its tip.
+        """The same link in its lowest modes with a rigid body at its tip.
 
         Parameters
         ----------
@@ -110,7 +111,7 @@ class Reduced:
         inertia : ndarray, shape (3, 3)
             Its inertia about the tip [kg m^2].
         count : int
-            How many modes.
+            Number of modes.
         """
         return _in_modes(self.arrays, self.carrying(mass, moment, inertia), count)
 
@@ -121,7 +122,7 @@ class Reduced:
         return self["modal_mass"] + mass * T @ T.T + R @ inertia @ R.T + cross + cross.T
 
     def scaled(self, stiffness, damping):
-        """The same with its stiffness, and the damping that it states, times factors."""
+        """The same link with its stiffness, and its damping if stated, multiplied by factors."""
         factors = {"modal_stiffness": stiffness, "modal_damping": damping}
         return _made({name: factors.get(name, 1.0) * value if name in factors else value
                       for name, value in self.arrays.items()})  # fmt: skip
@@ -137,7 +138,7 @@ def _made(arrays):
 
 
 class Shapes:
-    """Where the modes of such a link take the sections at its stations; what gauges at named points read.
+    """Motion of the sections at a link's stations in each mode, and strain of gauges at named points.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Where the sections of an arm's links are, bent and twisted: for pictures, and for rigid pieces in their place.
+r"""Computes the frames of the sections of bent and twisted links, for pictures and for the rigid pieces of a URDF.
 
 A section at x of a link has the frame that the link's tip would have if the link ended there. It always comes from the
 chain model (`chain`), since the models of one link have the same mode shapes. What does not change with the motion is
-prepared once; an evaluation then takes some 20 us a section.
+prepared once; an evaluation then takes some 20 us per section.
 """
 
 from dataclasses import replace
@@ -22,8 +22,8 @@ class Sections:
     count : int
         Spaces between the sections of a flexible link; a rigid one has its two ends.
     linear : bool
-        True: displacements linear in the deflections, whatever the arm's level; for deflections that are exaggerated
-        beyond what a link of constant length can do.
+        True: displacements are linear in the deflections, whatever the arm's level. This is for deflections that are
+        exaggerated beyond what a link of constant length can do.
 
     Attributes
     ----------

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Gauges to modal amplitudes and back.
+r"""Maps strains to modal amplitudes and back.
 
 A gauge at :math:`\eta` on a face at distance c from the neutral axis reads, for bending,
 
 .. math:: \varepsilon = -c\,y''(\eta) = -\frac{c}{L^2}\sum_i\phi_i''(\eta/L)\,\delta_i
 
 (tension positive: a beam bent towards +y is compressed on its +y face), and for twist
-:math:`\gamma = c\,\theta'(\eta)`. The rows R of all gauges give strain = gain * R delta + bias; the map back
-is weighted least squares, weights one over the noise variance:
+:math:`\gamma = c\,\theta'(\eta)`. The rows R of all gauges give strain = gain * R delta + bias; the map back is
+weighted least squares, with weights of one over the noise variance:
 
 .. math:: \hat\delta = (R_o^T W R_o)^{-1} R_o^T W\,(\varepsilon - b)
 
-with the gains in the rows. The noise variance of a reading is its noise's, and step^2/12 of a bridge that rounds to
-steps; independent from gauge to gauge, they give the amplitudes the covariance :math:`(R_o^T W R_o)^{-1}`.
+with the gains in the rows. The variance of a reading is that of its noise, plus step^2/12 if the bridge rounds to
+steps. The errors of different gauges are independent, so the amplitudes have the covariance :math:`(R_o^T W R_o)^{-1}`.
 Modes that the arm has but does not observe leak into the estimate by :math:`R_o^+R_u\delta_u`: spill-over.
 """
 
@@ -27,7 +27,7 @@ def gauge_rows(model, gauges, mode_names=None):
     Parameters
     ----------
     model : ArmModel
-        Whose mode shapes bend.
+        Its mode shapes are used.
     gauges : sequence of Gauge
     mode_names : sequence of str, optional
         Columns; all of the model's modes if not given.
@@ -58,9 +58,10 @@ def gauge_rows(model, gauges, mode_names=None):
 
 
 def reading_noise(gauges):
-    """Rms error of each gauge's reading as weights need it, shape (gauges,) [strain], and whether it was stated.
+    """Rms error of each gauge's reading for the weights, shape (gauges,) [strain], and whether any gauge states it.
 
-    A gauge without a stated noise weighs as the quietest one that has it; where none has it, all weigh alike.
+    A gauge without a stated noise has the weight of the quietest gauge that states one. If none does, all weights are
+    equal.
     """
     noise = np.array([g.uncertainty for g in gauges])
     stated = noise > 0.0
@@ -70,8 +71,8 @@ def reading_noise(gauges):
 def confused(rows, mode_names):
     """Modes that gauges with these rows can't tell apart.
 
-    Each column is scaled to one first, so that what counts is how unlike the patterns of strain are, and not
-    that a higher mode strains more.
+    Each column is first scaled to unit norm. So the difference between the patterns of strain counts, and not that a
+    higher mode strains more.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ def confused(rows, mode_names):
     unseen : tuple of str
         Modes that strain no gauge.
     alike : tuple of str
-        Modes among which a combination strains no gauge; empty where there is none.
+        Modes of which a combination strains no gauge; empty if there is none.
     """
     size = np.linalg.norm(rows, axis=0)
     seen = size > size.max(initial=0.0) / StrainMap.WORST_CONDITION
@@ -92,7 +93,7 @@ def confused(rows, mode_names):
     names = [n for n, s in zip(mode_names, seen, strict=True) if s]
     if not names:
         return unseen, ()
-    # With rows of zeros below, fewer gauges than modes have their null space too.
+    # Rows of zeros below make the null space complete if there are fewer gauges than modes.
     scaled = np.vstack([rows[:, seen] / size[seen], np.zeros((len(names), len(names)))])
     _, values, directions = np.linalg.svd(scaled)
     null = directions[values < values[0] / StrainMap.WORST_CONDITION]
@@ -106,7 +107,7 @@ class StrainMap:
     Parameters
     ----------
     model : ArmModel
-        The model that the observer believes in.
+        The model that the observer uses.
 
     Attributes
     ----------
@@ -115,7 +116,7 @@ class StrainMap:
     rows : ndarray, shape (gauges, modes)
         R_o, gain included.
     noise : ndarray, shape (gauges,)
-        Rms error of a reading that the weights stand for [strain]; 1 where no gauge states one.
+        Rms error of a reading on which the weights are based [strain]; 1 where no gauge states one.
     noise_stated : bool
         Whether any gauge states one.
     inverse : ndarray, shape (modes, gauges)
@@ -124,9 +125,9 @@ class StrainMap:
         Condition number of the weighted rows.
     """
 
-    #: Above this the gauges can't tell the modes apart and noise drowns the amplitudes.
+    #: Above this the gauges can't tell the modes apart, and noise hides the amplitudes.
     WORST_CONDITION = 1e6
-    #: So many sets of lost gauges have their inverses kept.
+    #: Number of sets of lost gauges for which inverses are kept.
     KEPT = 256
 
     def __init__(self, model):
@@ -210,8 +211,8 @@ class StrainMap:
     def inverse_without(self, lost):
         """`inverse` of the gauges that are not in `lost`, with zeros for the others; None where they don't suffice.
 
-        Each single loss is prepared at the start; several at once are worked out when they first come, about
-        0.1 ms, and kept.
+        The inverse for each single loss is prepared at the start. The inverse for several losses is computed when they
+        first occur, in about 0.1 ms, and kept.
         """
         if not lost:
             return self.inverse
@@ -227,14 +228,14 @@ class StrainMap:
         inverse = np.zeros_like(self.inverse)
         if not modes:
             return inverse
-        # Fewer gauges than modes would give a least-norm guess, which is no measurement.
+        # Fewer gauges than modes would give a guess of minimum norm, which is not a measurement.
         if left.size < modes or not np.linalg.cond(weighted) < self.WORST_CONDITION:
             return None
         inverse[:, left] = np.linalg.pinv(weighted) / self.noise[left]
         return inverse
 
     def unobservable_without(self, lost):
-        """Names of the modes that the gauges not in `lost` can't give, each by itself or apart from another."""
+        """Names of the modes that the gauges not in `lost` can't measure, or can't tell from one another."""
         left = np.setdiff1d(np.arange(len(self.gauge_names)), lost)
         unseen, alike = confused(self._weighted[left], self.mode_names)
         return tuple(n for n in self.mode_names if n in (*unseen, *alike))

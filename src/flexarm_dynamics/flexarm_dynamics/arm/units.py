@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion to SI, done once on reading; everything inside is SI.
+"""Converts to SI, once on reading; everything inside is SI.
 
 A dimension is written as powers of (force, length, time); imperial means ft, lbf, s, so that mass is
 lbf s^2/ft (slug) and inertia lbf ft s^2.

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""An arm as a URDF: each flexible link a chain of short rigid pieces that small joints bend and twist.
+r"""Writes an arm as a URDF: each flexible link is a chain of short rigid pieces that small joints bend and twist.
 
-A link of length L becomes N pieces of length h = L/N. Piece k points as the link's tangent does at its middle,
-:math:`x = (k + 1/2)h`, and the frame after the last one as the tip. So the chain's tip is off by
+A link of length L becomes N pieces of length h = L/N. Piece k has the direction of the link's tangent at the middle of
+the piece, :math:`x = (k + 1/2)h`. The frame after the last piece has the direction of the tip. So the chain's tip
+differs by
 
 .. math:: \sum_k h\,t(x_k) - \int_0^L t\,dx = O(h^2)
 
-from that of a beam of constant length with the tangent t. An arm whose level is the first order lets its links get
-longer as they bend, by :math:`\tfrac12\int y'^2 dx`; rigid pieces do not, and that much stays.
+from that of a beam of constant length with the tangent t. At the level `first_order`, links get longer as they bend, by
+:math:`\tfrac12\int y'^2 dx`. Rigid pieces do not, so this difference remains.
 
 Where two pieces meet there is one revolute joint for each way in which the link is flexible: about z for bending along
-y, about y for bending along z, about x for twist, in this order. Angles are of what is left of the turn from the
-chain as it is to the section as it should be, so that nothing adds up along the link.
+y, about y for bending along z, about x for twist, in this order. Each joint's angle corrects what is left of the
+rotation from the chain so far to the wanted section, so errors do not add up along the link.
 
-It is for display (RViz, robot_state_publisher, Foxglove). The small joints have no springs, so that a simulation of
-this URDF does not behave as the arm does. Rotors behind gears and the first motor, which does not move, are left out.
+It is for display (RViz, robot_state_publisher, Foxglove). The small joints have no springs, so a simulation of this
+URDF does not behave like the arm. Rotors behind gears and the first motor, which does not move, are left out.
 """
 
 import xml.etree.ElementTree as ET
@@ -28,9 +29,9 @@ from .sections import Sections
 
 #: Axis of the small joint for each direction, in the order of the turns Rz Ry Rx.
 AXES = {"y": (0.0, 0.0, 1.0), "z": (0.0, 1.0, 0.0), "twist": (1.0, 0.0, 0.0)}
-#: Radius of a link as it is drawn, of the length of all links [-].
+#: Radius of a link as it is drawn, relative to the length of all links [-].
 THICKNESS = 0.01
-#: What a small joint may turn by [rad]; URDF wants a number.
+#: Limit of a small joint's angle [rad]; URDF requires a number.
 BEND = 1.5
 
 
@@ -49,7 +50,7 @@ class PieceChain:
     ----------
     model : ArmModel
     pieces : int
-        Of each flexible link.
+        Number of pieces of each flexible link.
 
     Attributes
     ----------
@@ -120,7 +121,7 @@ class PieceChain:
 
 
 def angles(turn, directions):
-    """Turns about z, y and x, as far as there are joints for them, that make up a rotation.
+    """Angles about z, y and x that make up a rotation, for those axes that have a joint.
 
     Parameters
     ----------
@@ -244,7 +245,8 @@ class _Writer:
         mass, first, second, polar = link.moments(start, start + length)
         centre = first / mass
         across = second - mass * centre**2
-        # Sections have no inertia of their own in the model but for twist: a rod as it is drawn.
+        # In the model, sections have an inertia of their own only for twist; without it, use that of the rod that is
+        # drawn.
         along = polar or 0.5 * mass * self.radius**2
         inertia = np.diag([along, across, across]) + more
         self._inertial(body, mass, inertia, (centre - start, 0.0, 0.0))
@@ -283,7 +285,7 @@ class _Writer:
         ET.SubElement(joint, "origin", xyz=_text(*xyz))
 
     def _limits(self, joint):
-        """What the arm file says; a joint without ends is continuous, without the others it has room."""
+        """The limits of the arm file; a joint without position limits is continuous, other missing limits are large."""
         limits, element = joint.limits, self.last
         low, high = limits.position
         given = {
@@ -323,7 +325,7 @@ class _Writer:
 
 
 def _about(joint):
-    """Inertia of a hub, known about its joint's axis alone, shape (3, 3) [kg m^2]."""
+    """Inertia of a hub that is known only about its joint's axis, shape (3, 3) [kg m^2]."""
     return joint.hub_inertia * np.outer(joint.axis, joint.axis)
 
 

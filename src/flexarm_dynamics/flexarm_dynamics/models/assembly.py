@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From an arm to the constants in `kernels.chain_data`: mode shapes, loads, modal integrals, work space."""
+"""Computes the constants in `kernels.chain_data` from an arm: mode shapes, loads, modal integrals, work space."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -37,7 +37,7 @@ def _capacity(value, steps):
 
 
 def roomy(data):
-    """Sizes that many arms share, so that one compilation serves them all; room costs no time."""
+    """Array sizes that many arms share, so one compilation serves them all; unused room costs no time."""
     return _sizes(
         _capacity(data.links, (8, 32)),
         _capacity(data.s.shape[1], (16, 60)),
@@ -100,7 +100,7 @@ class Load:
     Attributes
     ----------
     averaged : bool
-        It turns about the next joint: as a load of a beam its first moment does not count.
+        Whether it turns about the next joint; then its first moment does not count in the load of a beam.
     """
 
     mass: float
@@ -204,7 +204,7 @@ def shapes_of(link, direction, flexibility, load):
 
 
 def _varied_shapes(link, direction, flexibility, load):
-    """As `shapes_of`, of a link whose section changes along it."""
+    """As `shapes_of`, for a link whose section changes along it."""
     if flexibility.shape == "from_frequencies":
         raise ModelError(
             "are for uniform links",
@@ -226,7 +226,7 @@ def _varied_shapes(link, direction, flexibility, load):
 
 
 def _on_beam(link, direction, load, place):
-    """A load at a place of a link as its beam problem has it."""
+    """A load at a place of a link, in the form that its beam problem needs."""
     L = link.length
     if direction == "twist":
         own = link.polar_inertia_per_length * L
@@ -260,12 +260,12 @@ def _clamped_mass(link, direction, shapes, load):
 
 
 def _along(link, name):
-    """A property of a link as a weight of integrals along it."""
+    """A property of a link as the weight of integrals along it."""
     return lambda xi: link.factor(name, xi)
 
 
 def node_count(link, modes, level):
-    """Quadrature nodes in each span of a link between its breaks, for so many modes in a direction."""
+    """Number of quadrature nodes in each span of a link between its breaks, for this number of modes in a direction."""
     # Slopes squared are integrated to some 1e-12, roots of them to 1e-9 up to slopes of 0.6.
     extra = 6 if level == kernel.FORESHORTENING else 12
     widest = np.diff(link.breaks).max()
@@ -274,7 +274,7 @@ def node_count(link, modes, level):
 
 @dataclass(frozen=True)
 class Nodes:
-    """Quadrature over a link, or its part up to a section, between its breaks.
+    """Quadrature over a link, or over its part up to a section, in spans between its breaks.
 
     Attributes
     ----------
@@ -371,7 +371,7 @@ def assemble(arm, shapes, loads):
         "body_x": z(B), "body_tip": z((B, K)), "body_slope": z((B, K)), "body_bishop": z((B, K, K)),
         "body_mass": z(B), "body_moment": z((B, 3)), "body_inertia": z((B, 3, 3)),
     }  # fmt: skip
-    # An axis (0, 0, 1) of integers is another type, and would be another compilation.
+    # An axis (0, 0, 1) of integers has another type, and would cause another compilation.
     a = {name: v if name in INTEGERS else np.asarray(v, float) for name, v in a.items()}
     for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
         L = link.length
@@ -428,7 +428,7 @@ def assemble(arm, shapes, loads):
     return data
 
 
-#: Constants of reduced links by the names of their arrays; the second order stays out at the first.
+#: Constants of reduced links by the names of their arrays; the level of first order leaves out the second order.
 _REDUCED = {
     "red_C": "translation", "red_l": "rotation", "red_H": "first", "red_G": "second",
     "red_T": "tip_translation", "red_R": "tip_rotation",
@@ -472,7 +472,7 @@ def _fill_reduced(a, i, link, r, load):
 
 
 def _fill_bodies(a, i, link, modes, nodes, bodies):
-    """The constants of the bodies on link i, which are among those of all links."""
+    """Write the constants of the bodies on link i into the arrays of all links' bodies."""
     own = [b for b, (host, _) in enumerate(bodies) if host == i]
     for b, node in zip(own, nodes.bodies, strict=True):
         body = bodies[b][1]

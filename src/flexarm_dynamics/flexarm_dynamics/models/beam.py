@@ -26,7 +26,7 @@ from ..errors import ModelError
 #: Modal integrals are computed to this, relative to the largest entry (Gauss-Legendre, tested).
 INTEGRAL_TOLERANCE = 1e-12
 
-#: Heaviest tip load, in masses and inertias of the beam: the lowest wave number stays where it has digits.
+#: Heaviest tip load, relative to the beam's mass and inertia: up to this the lowest wave number is accurate.
 MAX_LOAD = 1e10
 
 
@@ -241,8 +241,7 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
     Raises
     ------
     ModelError
-        When the load is heavier than `MAX_LOAD`, or when the frequency equation has fewer roots than
-        asked for in the range searched.
+        If the load is heavier than `MAX_LOAD`, or if the frequency equation has too few roots in the range searched.
     """
     mass = tip_mass / (mass_per_length * length)
     moment = tip_mass * tip_offset / (mass_per_length * length**2)
@@ -259,7 +258,7 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
 
     def determinant(beta):
         m = _loaded_matrix(beta, mass, inertia, moment)
-        # Unit rows: roots stay where they are, and no load, however heavy, drowns the sign.
+        # Rows are scaled to unit norm: the roots stay, and the sign is clear even for a very heavy load.
         m = m / np.linalg.norm(m, axis=-1, keepdims=True)
         return m[0, ..., 0] * m[1, ..., 1] - m[0, ..., 1] * m[1, ..., 0]
 
@@ -354,7 +353,7 @@ def twist(modes, length, polar_inertia_per_length, tip_inertia=0.0):
     def tip_condition(b):
         return np.cos(b) - ratio * b * np.sin(b)
 
-    # A hair beyond pi/2: with a free tip the root is there, and its cosine rounds to either side of zero.
+    # Slightly beyond pi/2: with a free tip the root is there, and its cosine rounds to either side of zero.
     brackets = [(i * np.pi, (i + 0.5) * np.pi + 1e-9) for i in range(modes)]
     roots = [brentq(tip_condition, lo, hi, xtol=1e-15, rtol=8.9e-16) for lo, hi in brackets]
     return TwistShapes(np.array(roots))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Arms of any number of links, rigid or flexible: the general model, evaluated by `kernels.chain`.
+r"""The general model: arms with any number of rigid or flexible links, evaluated by `kernels.chain`.
 
 Every link is a uniform beam along its frame's x axis, which bends (Euler-Bernoulli, no rotary inertia of the
 sections in bending) and twists (with the sections' polar inertia) in the assumed modes of the arm file:
@@ -51,21 +51,21 @@ from .assembly import (
 )
 from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation
 
-#: Each after those whose functions it calls.
+#: In this order: each module comes after those whose functions it calls.
 _MODULES = (
     chain_data, vectors, sections, bodies, placing, transmissions, recursions, chain, implicit_steps, integrators,
 )  # fmt: skip
 CHAIN_SOURCES = tuple(load.source(module) for module in _MODULES)
-#: For arms without transmissions and housings, and with Coulomb's friction at most.
+#: For arms without transmissions, without housings, and without friction beyond Coulomb's.
 PLAIN_SOURCES = (
     CHAIN_SOURCES[0].replace("JOINT_PARTS = True", "JOINT_PARTS = False"),
     *CHAIN_SOURCES[1:],
 )
 
-#: Short enough to be written out in the integrators' loops.
+#: Functions that are short enough to be inlined in the integrators' loops.
 INLINE = ("derivative", "net_torque", "low_storage")
 
-#: Imaginary step of the complex-step derivatives: no difference is taken, so that it costs no digits.
+#: Imaginary step of the complex-step derivatives: no difference is taken, so no digits are lost.
 STEP = 1e-30
 
 
@@ -78,7 +78,7 @@ class Chain(ArmModel):
     compiled : bool
         False: evaluate the kernels as plain Python, for debugging; some hundred times slower.
     shapes : mapping, optional
-        (link, direction) to `beam.ModeShapes`, where they are not to be those of this arm's own loads.
+        (link, direction) to `beam.ModeShapes`; if not given, the shapes follow from this arm's own loads.
     """
 
     def __init__(self, arm, compiled=True, shapes=None):
@@ -112,7 +112,7 @@ class Chain(ArmModel):
 
     @cached_property
     def complex_kernel(self):
-        """The same for complex numbers: a module of its own, so that both can be compiled at once."""
+        """The kernels for complex numbers: a module of its own, so that both can be compiled at once."""
         return load.joined("chain_complex", self._sources, self._compiled)
 
     @cached_property
@@ -140,7 +140,7 @@ class Chain(ArmModel):
         return self._new_work(complex)
 
     def _check_inertia(self):
-        """Refuse an arm with a motion that moves no mass: a roll joint on a line of mass, say."""
+        """Refuse an arm that has a motion without moving mass, for example a roll joint on a line of mass."""
         n = self.n_joints
         for q in (np.zeros(n), 0.7 + np.arange(n)):
             M = self.mass_matrix(q)
@@ -180,9 +180,9 @@ class Chain(ArmModel):
         return M
 
     def forces(self, q, qd, delta=None, delta_d=None):
-        """What the joints and modes must give at zero acceleration, friction aside; shape (n + m,).
+        """Generalised forces at zero acceleration, without friction; shape (n + m,).
 
-        Coriolis, centrifugal, gravitational and elastic forces and modal damping: all of (2) but M.
+        Coriolis, centrifugal, gravitational and elastic forces and modal damping: all of (2) except the term with M.
         """
         return self._forces(q, qd, None, delta, delta_d, None)
 
@@ -208,7 +208,7 @@ class Chain(ArmModel):
     def transmitted_torque(self, delta, delta_d):
         """Torque from each link to its motor through the transmission, (k, n) [N m]; NaN for joints without one.
 
-        Of amplitudes and rates, both (k, m).
+        `delta` and `delta_d` are amplitudes and rates, both (k, m).
         """
         out = np.full((len(delta), self.n_joints), np.nan)
         for i in np.flatnonzero(self.data.spring >= 0):
@@ -217,7 +217,7 @@ class Chain(ArmModel):
         return out
 
     def inverse_dynamics(self, q, qd, qdd, delta=None, delta_d=None, delta_dd=None):
-        """As `ArmModel.inverse_dynamics`; what is left out is zero."""
+        """As `ArmModel.inverse_dynamics`; arguments that are not given are zero."""
         out = self._forces(q, qd, qdd, delta, delta_d, delta_dd)
         out[: self.n_joints] += self.friction(self._joint(qd, "qd"), delta, delta_d)
         return out
@@ -257,7 +257,7 @@ class Chain(ArmModel):
             C[self.n_joints + j, j] += damping
 
     def _add_transmissions(self, K, C, delta, delta_d):
-        """Add derivatives of the transmissions' torque, play and all."""
+        """Add derivatives of the transmissions' torque, including the play."""
         for j, c in self._transmissions:
             stiffness, damping, half, load, rounding, within = c
             s, row = transmissions.dead_zone(delta[j], half, rounding), self.n_joints + j
@@ -272,9 +272,9 @@ class Chain(ArmModel):
         """Terms of (2).
 
         C and K are the derivatives of the forces by delta_d and delta at the straight arm (Jacobian of the
-        elastic, centrifugal, Coriolis and gravitational forces). Without deflections f is what is left at
-        the straight arm: the paper's control model, assumptions a) and b). With deflections f takes the
-        products of deflections as well, so that f + C delta_d + K delta is exact.
+        elastic, centrifugal, Coriolis and gravitational forces). Without deflections, f is the force at the straight
+        arm: this is the paper's control model, assumptions a) and b). With deflections, f also contains the products of
+        deflections, so f + C delta_d + K delta is exact.
         """
         n = self.n_joints
         q, qd = self._joint(q, "q"), self._joint(qd, "qd")
@@ -302,7 +302,7 @@ class Chain(ArmModel):
 
     @cached_property
     def _tape(self):
-        """Terms of the straight arm, recorded: control laws ask for them at every sample; None where there is none."""
+        """Recorded terms of the straight arm, which control laws need at every sample; None if not recorded."""
         if not self._compiled or self.data.level != chain_data.FIRST_ORDER:
             return None
         return self._recorded(straight_arm.Terms)
@@ -312,7 +312,7 @@ class Chain(ArmModel):
 
     @cached_property
     def _slow_tape(self):
-        """The torque of the slow subsystem, recorded; None where there are no recorded terms, or others are added."""
+        """Recorded torque of the slow subsystem; None if no terms are recorded, or if other terms are added to them."""
         if self._tape is None or self._transmissions or self._slips:
             return None
         return self._recorded(straight_arm.SlowTorque)
@@ -343,7 +343,7 @@ class Chain(ArmModel):
 
     @cached_property
     def _none(self):
-        """What a free motion gives to the forward recursion: no extra inertia, no driven joint."""
+        """Arguments of the forward recursion for a free motion: no extra inertia, no driven joint."""
         n, K = self.data.links, self.data.s.shape[1]
         return np.zeros((n, 2)), np.zeros((n, K, K)), np.zeros(n, np.int64), np.zeros(self.n_modes)
 
@@ -377,7 +377,7 @@ class Chain(ArmModel):
         return type(self)(self.arm.without_play, self._compiled, self._shapes)
 
     def transmission_rates(self):
-        """As `ArmModel.transmission_rates`: of spring or damper with the rest of the arm free, in a straight arm."""
+        """As `ArmModel.transmission_rates`: rates of spring or damper with the rest of a straight arm free."""
         if not self._transmissions:
             return 0.0, 0.0
         H = np.linalg.inv(self.mass_matrix(np.zeros(self.n_joints)))
@@ -391,7 +391,7 @@ class Chain(ArmModel):
     def static_deflection(self, q):
         """As `ArmModel.static_deflection`; with play, each link rests on the flank to which its load presses it.
 
-        A link that no load turns rests in the middle of its play; one that hangs in it, where it hangs.
+        A link without load rests in the middle of its play. A link that hangs within its play rests where it hangs.
         """
         sharp = self._on_flanks(q)
         rounded = [(j, c) for j, c in self._transmissions if c[4] > 0.0]
@@ -427,7 +427,7 @@ class Chain(ArmModel):
             ]
             if not pulled:
                 return delta
-            for j in pulled:  # a flank can't pull: the other one, else none
+            for j in pulled:  # a flank can't pull: try the other one, then none
                 (hangs if j in turned else turned).add(j)
                 side[j] = -side[j]
 
@@ -460,7 +460,7 @@ class Chain(ArmModel):
     # Kinematics --------------------------------------------------------------------------------
 
     def frames(self, q, delta=None):
-        """Orientation and origin of each link's base frame, and last of the tip's, in the base frame.
+        """Orientation and origin of each link's base frame, and at the end of the tip frame, in the base frame.
 
         Returns
         -------
@@ -494,7 +494,7 @@ class Chain(ArmModel):
 
         Rows: linear [m/s], angular [rad/s], in the base frame; columns: (qd, delta_d).
 
-        The point is at `position` [m] along the link's axis, and off it by `offset` [m] in the section's frame.
+        The point is at `position` [m] along the link's axis, with an `offset` [m] from it in the section's frame.
         """
         return self._point(link, position, q, delta, offset)[1]
 
@@ -537,7 +537,7 @@ class Chain(ArmModel):
         )
 
     def _cut_reduced(self, index, position):
-        """The same of a link given by reduced matrices, between whose stations sections are linear."""
+        """As `_cut`, for a link given by reduced matrices; between its stations, sections are interpolated linearly."""
         d, link = self.data, self.arm.links[index]
         r, part = d.reduced[index], position / link.length
         translation, rotation = self._shapes[link.name, REDUCED].at(part * link.tip[0])
@@ -547,7 +547,7 @@ class Chain(ArmModel):
         T[r, m], R[r, m] = translation, rotation
         if (
             part < 1.0
-        ):  # the archive has the second order of the tip alone: in proportion, for pictures
+        ):  # the archive has the second order only at the tip: in proportion, for pictures
             T2[r], R2[r] = part * T2[r], part * R2[r]
         return d._replace(links=index + 1, red_tip=place, red_T=T, red_R=R, red_T2=T2, red_R2=R2)
 
@@ -578,7 +578,7 @@ class Chain(ArmModel):
         return self.velocity(link.name, link.length, q, qd, delta, delta_d)[:3]
 
     def tip_deflection(self, delta, link=None):
-        """Deflection of a link's tip along y and z of its base frame (last link if not named), (2,) [m]."""
+        """Deflection of a link's tip (by default the last one's) along y and z of the link's base frame, (2,) [m]."""
         delta = self._modal(delta, "delta")
         names = [item.name for item in self.arm.links]
         i = len(names) - 1 if link is None else names.index(link)
@@ -600,7 +600,7 @@ class Chain(ArmModel):
         R, p = self.frames(q, delta)
         ends = p[1:].copy()
         for i in range(self.n_joints - 1):
-            # The next joint sits off the tip by its origin, in the tip's frame: undo that joint's turn.
+            # The next joint is away from the tip by its origin, in the tip's frame: undo that joint's turn.
             joint = self.arm.joints[i + 1]
             place = self.data.spring[i + 1]
             angle = q[i + 1] + (delta[place] if delta is not None and place >= 0 else 0.0)
@@ -610,16 +610,16 @@ class Chain(ArmModel):
 
     @cached_property
     def planar_axis(self):
-        """Axis of an arm whose joints all turn about parallel axes, in the base frame; None for others."""
+        """Common axis, in the base frame, of an arm whose joints all turn about parallel axes; None for other arms."""
         R, _ = self.frames(np.zeros(self.n_joints))
         axes = np.einsum("ijk,ik->ij", R[:-1], self.data.axis)
         return axes[0] if np.allclose(np.cross(axes, axes[0]), 0.0, atol=1e-9) else None
 
     def base_angles(self, q, delta=None):
-        """Absolute rotation of each link's base about its joint's axis, of a planar arm, shape (n,) [rad].
+        """Absolute rotation of each link's base about its joint's axis, for a planar arm, shape (n,) [rad].
 
-        From the base frame's orientation, fixed turns of the joints' origins left out; counted on beyond a
-        turn. For a straight planar arm the sum of the joint angles.
+        It is measured from the base frame's orientation, without the fixed turns of the joints' origins, and counted
+        beyond a full turn. For a straight planar arm it is the sum of the joint angles.
         """
         q = self._joint(q, "q")
         R, _ = self.frames(q, delta)
@@ -640,12 +640,12 @@ class Chain(ArmModel):
 
     @cached_property
     def straight_line(self):
-        """Generated right-hand side of this arm's structure: (module, constants); None where it is too long."""
+        """Generated right-hand side of this arm's structure: (module, constants); None if it is too long."""
         return self._generated and self._generated[:2]
 
     @cached_property
     def _generated(self):
-        """As `straight_line`, with how sums get into the code."""
+        """As `straight_line`, and also the way in which sums get into the code."""
         if not self._compiled:
             return None
         for way in generated.ways(self.data):
@@ -694,10 +694,10 @@ class Chain(ArmModel):
         return Stepper(self, step, trajectory, arguments, data, lock)
 
     def driven_stepper(self, method):
-        """As `stepper`, with joint accelerations [rad/s^2] in the place of torque: prescribed motion.
+        """As `stepper`, with joint accelerations [rad/s^2] in place of torque: prescribed motion.
 
-        By `method`, a value of `fixed_step.METHODS`. Of a joint with a transmission the motor's motion is prescribed;
-        the link's follows.
+        `method` is a value of `fixed_step.METHODS`. For a joint with a transmission the motor's motion is prescribed,
+        and the link follows.
         """
         none = [np.zeros_like(part) for part in self._none]
         none[2][:] = 1
@@ -706,7 +706,7 @@ class Chain(ArmModel):
             stepper = self._implicit(data, np.zeros((4, 2 * (self.n_joints + self.n_modes))))
         else:
             stepper = explicit_stepper(self.kernel, method, data, self)
-        # Friction is part of the torque that it takes, not of the motion.
+        # Friction adds to the torque that the motion needs; it does not change the motion.
         stepper.friction[:, :2] = 0.0
         return stepper
 

@@ -2,9 +2,9 @@
 r"""Fixed-step methods for an arm's compiled integrators, and how short their steps must be.
 
 Dormand and Prince's explicit Runge-Kutta method of order eight (scipy's tableau): with omega h = 1 it loses 3e-7 of a
-mode's energy a period, and of one of half the frequency 6e-10; RK4 loses 9e-7 with omega h = 0.1. With omega h = 2
-Dormand and Prince's loses 2e-4, of a mode whose structural damping of 0.01 takes 0.12: such a mode need not be resolved
-as if it rang for ever.
+mode's energy per period, and 6e-10 for a mode of half that frequency. RK4 loses 9e-7 with omega h = 0.1. With omega h =
+2, Dormand and Prince's method loses 2e-4, while a structural damping of 0.01 takes 0.12 of the mode's energy: such a
+mode need not be resolved as if it rang for ever.
 """
 
 import numpy as np
@@ -16,8 +16,8 @@ from .model import Tableau
 _STAGES = DOP853.n_stages
 
 #: Two explicit Runge-Kutta methods, of order 8 and 4, and a linearly implicit one of order 2
-#: (`kernels.implicit_steps.implicit_step`), which stays stable however stiff the highest modes are, at rest: what a
-#: motion's loads add to the stiffness of a bent arm is taken explicitly.
+#: (`kernels.implicit_steps.implicit_step`). At rest, the latter stays stable however stiff the highest modes are; the
+#: stiffness that a motion's loads add to a bent arm is treated explicitly.
 METHODS = {
     "dop853": Tableau(
         np.ascontiguousarray(DOP853.A[:_STAGES, :_STAGES]),
@@ -34,22 +34,22 @@ METHODS = {
 
 #: Highest angular frequency times substep of the explicit methods.
 PHASE_PER_STEP = {"dop853": 1.0, "rk4": 0.1}
-#: A damped mode may turn by more, up to this, while the method takes no more than this part of the energy that the
-#: mode's own damping takes.
+#: A damped mode may have a larger phase per step, up to this, as long as the method takes no more than this fraction of
+#: the energy that the mode's own damping takes.
 DAMPED_PHASE_PER_STEP, PART_OF_DAMPING = {"dop853": 2.0, "rk4": 0.1}, 0.01
-#: Where there is play, fastest transmission's angular frequency times substep, of all methods: each time flanks meet
-#: or part, a step loses some 1e-6 of the energy.
+#: With play: angular frequency of the fastest transmission times substep, for all methods. Each time flanks meet or
+#: part, a step loses some 1e-6 of the energy.
 PLAY_PHASE_PER_STEP = 0.05
-#: More substeps than this per sample is no simulation any more.
+#: A simulation that needs more substeps than this per sample is refused.
 MAX_SUBSTEPS = 10_000
 
 
 def substeps(model, period, method="dop853", undamped=False):
     """Substeps per sample that keep the highest free mode's phase below `PHASE_PER_STEP`; implicit: one.
 
-    Without transmissions, damped modes may turn by up to `DAMPED_PHASE_PER_STEP`, see there.
+    Without transmissions, the phase of damped modes may be up to `DAMPED_PHASE_PER_STEP`, see there.
 
-    With play in a transmission, all methods also keep that one's phase below `PLAY_PHASE_PER_STEP`.
+    With play in a transmission, all methods also keep the transmission's phase below `PLAY_PHASE_PER_STEP`.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def substeps(model, period, method="dop853", undamped=False):
 
 
 def lost(method, phase):
-    r"""Part of a mode's energy that an explicit method takes a period, by the mode's phase per step, (k,).
+    r"""Fraction of a mode's energy that an explicit method takes per period, by the mode's phase per step, (k,).
 
     :math:`1 - |R(i\phi)|^{4\pi/\phi}`, with the method's :math:`R(z) = 1 + z\,b^T(I - zA)^{-1}\mathbf{1}`.
     """

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Inverse kinematics: joint angles that put the tip at a point, of the straight or of the statically bent arm.
+r"""Inverse kinematics: finds joint angles that put the tip of the straight or of the statically bent arm at a point.
 
 The tip of an arm at rest is :math:`p(q, \delta_s(q))`, with :math:`\delta_s` the deflections under gravity
-(`ArmModel.static_deflection`), so that the sag of the links is taken into account. Newton's method takes the smallest
-step that reaches the point, damped after Levenberg and Marquardt,
+(`ArmModel.static_deflection`), so the sag of the links is taken into account. Newton's method takes the smallest step
+that reaches the point, damped after Levenberg and Marquardt,
 
 .. math:: \Delta q = J^T (J J^T + \lambda I)^{-1} (p_{wanted} - p), \qquad
     J = \frac{\partial p}{\partial q} - \frac{\partial p}{\partial\delta}
     \left(\frac{\partial F_2}{\partial\delta}\right)^{-1} \frac{\partial F_2}{\partial q},
 
-:math:`F_2` the forces on the modes at rest. The smallest step keeps an arm with more joints than it needs near where
-it starts. A joint that would leave its limits is held at the limit.
+:math:`F_2` the forces on the modes at rest. The smallest step keeps a redundant arm near where it starts. A joint that
+would leave its limits is held at the limit.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,8 @@ TOLERANCE = 1e-10
 #: No joint turns farther in one step of the search [rad].
 MAX_STEP = 0.5
 _STEPS = 100
-#: How far from the start further searches begin [rad]: out of singular configurations, and around limits.
+#: Distances from the start at which further searches begin [rad], to leave singular configurations and get around
+#: limits.
 _SPREADS = (0.05, 0.3, 1.0, 2.0, 3.0)
 
 
@@ -41,7 +42,7 @@ class Solution:
     tip : (3,) array
         The tip there [m].
     distance : float
-        From the point that was asked for [m].
+        Distance from the wanted point [m].
     """
 
     q: np.ndarray
@@ -87,7 +88,7 @@ class TipKinematics:
     def _modal_forces(self, q, delta):
         """Forces on the modes at rest, (m,): zero at the deflections of `deflection`."""
         n, rest = self.model.n_joints, np.zeros(self.model.n_joints)
-        if isinstance(self.model, Chain):  # without the derivatives that its terms come with
+        if isinstance(self.model, Chain):  # without computing the derivatives in its terms
             return self.model.forces(q, rest, delta)[n:]
         terms = self.model.terms(q, rest, delta, np.zeros(self.model.n_modes))
         return terms.f2 + terms.K2 @ delta
@@ -129,7 +130,7 @@ def solve(model, target, start=None, bent=True) -> Solution:
     Parameters
     ----------
     model : ArmModel
-        Of any kind that knows its tip's position.
+        Any model that knows its tip's position.
     target : (3,) array_like
         In the base frame [m].
     start : (n,) array_like, optional

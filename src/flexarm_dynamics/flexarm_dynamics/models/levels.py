@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Levels of the kinematics of bending, at which an arm is simulated, and what each leaves out.
+r"""Chooses the level of the bending kinematics at which an arm is simulated, and estimates what each level leaves out.
 
-`first_order`: displacements are linear in the deflections. `stiffening`: links keep their length to second order, so
-that a spinning link is stiffer. `finite_slope`: they keep it exactly, and their curvature and their tips' angles hold
-for large slopes. See docs/dynamics.md.
+`first_order`: displacements are linear in the deflections. `stiffening`: links keep their length to second order, so a
+spinning link is stiffer. `finite_slope`: they keep it exactly, and their curvature and their tips' angles hold for
+large slopes. See docs/dynamics.md.
 
-Of a link with slopes :math:`s^2 = y'^2 + z'^2`, deflection d of its tip and a length l of arm beyond it, the first
+For a link with slopes :math:`s^2 = y'^2 + z'^2`, deflection d of its tip and a length l of the arm beyond it, the first
 term that is left out moves the arm's tip by about
 
 .. math::
     e_1 = \tfrac12\int_0^L s^2 dx + |\phi(L)^T K^{-1} K_g\,\delta|, \qquad
     e_2 = \tfrac12 s^2 d + \tfrac16 s^3 l, \qquad e_3 = \tfrac18 s^4 d
 
-at the three levels: the foreshortening, and the bending that the geometric stiffness :math:`K_g` of the axial forces
-would prevent or add; the curvature's factor :math:`(1-s^2)^{-1/2}` and the angle's :math:`\arcsin s - s`; the next
-term of both, which shapes of small deflections can't follow.
+at the three levels. The first is the foreshortening, and the bending that the geometric stiffness :math:`K_g` of the
+axial forces would prevent or add. The second comes from the curvature's factor :math:`(1-s^2)^{-1/2}` and from the
+angle's :math:`\arcsin s - s`. The third is the next term of both, which shapes of small deflections can't follow.
 """
 
 from dataclasses import dataclass, replace
@@ -32,18 +32,18 @@ LEVELS = (AUTO, FIRST_ORDER, STIFFENING, FINITE_SLOPE)
 
 #: `auto` takes the lowest level that leaves out less than this at the tip under the largest known loads [m].
 NEGLIGIBLE = 1e-6
-#: Deflections under suddenly applied loads, in parts of those at rest [-].
+#: Deflections under suddenly applied loads, relative to those at rest [-].
 OVERSHOOT = 2.0
-#: A level is beyond its range where it leaves out more than this part of the arm's length [-].
+#: A level is beyond its range if it leaves out more than this fraction of the arm's length [-].
 TOLERANCE = 1e-4
-#: Largest slope to which `finite_slope` was held against independent codes [-].
+#: Largest slope at which `finite_slope` was compared with independent codes [-].
 MAX_SLOPE = 0.5
-#: Stations along a link where its slopes are looked at: Gauss points, and the tip.
+#: Stations along a link where its slopes are evaluated: Gauss points, and the tip.
 _STATIONS = 8
 
 
 def level_of(arm):
-    """The level of the model that `model.build` makes of an arm: its flags'."""
+    """The level of the model that `model.build` makes of an arm, from the arm's flags."""
     if arm.finite_slope:
         return FINITE_SLOPE
     return STIFFENING if arm.foreshortening else FIRST_ORDER
@@ -78,7 +78,7 @@ def at_level(arm, level):
 
 @dataclass(frozen=True)
 class Drive:
-    """What is known of a run's motion, where that is more than the limits of the arm's joints; each (n,) or None.
+    """What is known of a run's motion beyond the limits of the arm's joints; each (n,) or None.
 
     Attributes
     ----------
@@ -100,10 +100,11 @@ def simulated(arm, level=AUTO, drive=None, negligible=NEGLIGIBLE):
     ----------
     arm : Arm
     level : str
-        One of `LEVELS`. With `auto` the lowest one, yet not below its file's flags, that leaves out less than
-        `negligible` under the largest loads that are known: gravity with the joints straight or one of them at right
-        angles, and the torques of the `drive`, or of the joints' limits, suddenly applied. Without limits, loads are
-        unknown: `finite_slope`. Models other than `chain` have their own kinematics, and stay as they are.
+        One of `LEVELS`. `auto` takes the lowest level that leaves out less than `negligible` under the largest known
+        loads, but none below the flags of the arm file. These loads are gravity, with the joints straight or one of
+        them at right angles, and the torques of the `drive`, or of the joints' limits, suddenly applied. Without limits
+        the loads are unknown, and the level is `finite_slope`. Models other than `chain` have their own kinematics, and
+        stay as they are.
     drive : Drive, optional
     negligible : float
         At the tip [m].
@@ -132,7 +133,7 @@ def _bends(arm):
 def neglected(arm, drive=None):
     """What `first_order` and `stiffening` leave out at the tip under the largest known loads [m].
 
-    Of an `arm`, with what is known of its `drive`: see `simulated`.
+    `arm` and `drive` are those of `simulated`.
 
     Returns
     -------
@@ -169,7 +170,7 @@ def neglected(arm, drive=None):
 
 
 def _poses(n):
-    """Joint angles at which loads are looked at: straight, and each joint at right angles."""
+    """Joint angles at which loads are evaluated: straight, and each joint at right angles."""
     yield np.zeros(n)
     for i in range(n):
         for side in (-0.5, 0.5):
@@ -211,7 +212,7 @@ class Slopes:
         self._lever = np.array([self._lever[name] for name in self.names])
 
     def of(self, delta, added=False):
-        """Slope of each link at the stations, (links, stations) [-]; `added`: of all modes' sizes."""
+        """Slope of each link at the stations, (links, stations) [-]; `added`: with the sizes of all modes added up."""
         rows = np.abs(self._slope) if added else self._slope
         return np.hypot(*(rows @ delta))
 
@@ -221,9 +222,9 @@ class Slopes:
         return np.hypot(*(rows @ delta))
 
     def neglected(self, delta, added=False):
-        """What each level leaves out at the arm's tip, geometric stiffness apart: e1, e2, e3 [m].
+        """What each level leaves out at the arm's tip, without the geometric stiffness: e1, e2, e3 [m].
 
-        Of modal amplitudes `delta` (m,); `added` as for `of`.
+        `delta` are modal amplitudes (m,); `added` as for `of`.
         """
         s, d = self.of(delta, added), self.deflection(delta, added)
         top = s.max(axis=1)
@@ -271,9 +272,9 @@ class Range:
         return Chain(at_level(model.arm, STIFFENING), shapes=shapes), model.stiffness_matrix()
 
     def check(self, q, qd, delta):
-        """Take one state into account; True if the level has left its range just now.
+        """Take one state into account; True if this state is the first beyond the range of the level.
 
-        Joint angles `q` and speeds `qd`, both (n,), and amplitudes `delta` (m,).
+        The state has joint angles `q` and speeds `qd`, both (n,), and amplitudes `delta` (m,).
         """
         if not self.watched or self.warning:
             return False

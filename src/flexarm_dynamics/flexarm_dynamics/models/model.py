@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What every model of an arm offers, and the terms of the equations of motion (2).
+r"""Defines what every model of an arm offers, and the terms of the equations of motion (2).
 
 .. math::
     M(q,\delta)\begin{bmatrix}\ddot q\\ \ddot\delta\end{bmatrix}
@@ -71,9 +71,9 @@ class ArmModel(ABC):
 
     def __init__(self, arm):
         self.arm = arm
-        #: The arm that the mode shapes are made for, and the factor of its payload: see `with_payload`.
+        #: The arm for which the mode shapes are made, and the factor of its payload: see `with_payload`.
         self.origin = arm, 1.0
-        #: By what they know: see `fuller`.
+        #: Models that `fuller` has made, by its arguments.
         self._fuller = {}
         self.joint_names = arm.joint_names
         self.mode_names = arm.mode_names
@@ -95,8 +95,8 @@ class ArmModel(ABC):
     def terms(self, q, qd, delta=None, delta_d=None):
         """Terms of (2).
 
-        Without deflections, the paper's control model: a) H does not depend on the deflections, b) no
-        products of deflections, so that C1 and K1 depend on the joints alone.
+        Without deflections, they are the paper's control model: a) H does not depend on the deflections, b) no products
+        of deflections, so that C1 and K1 depend on the joints alone.
 
         Returns
         -------
@@ -109,7 +109,7 @@ class ArmModel(ABC):
         Parameters
         ----------
         motions : ndarray, shape (k, 3, n)
-            Of the joints: positions [rad] and velocities [rad/s] are taken, accelerations are not.
+            Positions [rad], velocities [rad/s] and accelerations of the joints; the accelerations are not used.
         """
         each = [self.terms(motion[0], motion[1]) for motion in motions]
         return Terms(*map(np.array, zip(*each, strict=True)))
@@ -122,7 +122,7 @@ class ArmModel(ABC):
     def inverse_dynamics(self, q, qd, qdd, delta, delta_d, delta_dd):
         """Generalised forces (joint torque, modal force) of a motion, friction included; shape (n + m,).
 
-        Of a free motion the modal part is zero.
+        For a free motion the modal part is zero.
         """
         t = self.terms(q, qd, delta, delta_d)
         out = t.M @ np.concatenate([qdd, delta_dd])
@@ -133,7 +133,8 @@ class ArmModel(ABC):
     def slow_torque(self, q, qd, acceleration):
         """Torque (n,) that gives the slow subsystem (10) an acceleration at q, qd, (n,) each [N m].
 
-        As `singular_perturbation.slow_torque` of the `terms` there, without those that it does not need.
+        As `singular_perturbation.slow_torque` with the `terms` at this state, without computing those that it does not
+        need.
         """
         return slow_torque(self.terms(q, qd), acceleration)
 
@@ -155,7 +156,7 @@ class ArmModel(ABC):
 
     @abstractmethod
     def tip_deflection(self, delta, link=None):
-        """Deflection of a link's tip (the last one's) in its base frame, shape (2,): along y and z [m]."""
+        """Deflection of a link's tip (default: the last link's) along y and z of its base frame, shape (2,) [m]."""
 
     @abstractmethod
     def mode_shapes(self, link, direction):
@@ -164,7 +165,7 @@ class ArmModel(ABC):
     def friction_table(self):
         """Friction of the joints as the integrators take it: viscous, Coulomb, smoothing speed; shape (n, 3).
 
-        Stribeck's part, and that of the transmitted torque, are in the equations of motion.
+        The Stribeck part, and the part from the transmitted torque, are in the equations of motion.
         """
         return self._friction.copy()
 
@@ -188,13 +189,13 @@ class ArmModel(ABC):
         """
 
     def driven_stepper(self, method):
-        """As `stepper`, with joint accelerations in the place of torque; None: the model has none."""
+        """As `stepper`, with joint accelerations in place of torque; None: the model has none."""
         return None
 
     def lockable_stepper(self, method):
         """As `stepper`, with `Stepper.lock`: for brakes.
 
-        `method` as there.
+        `method` is that of `stepper`.
 
         Raises
         ------
@@ -209,7 +210,7 @@ class ArmModel(ABC):
 
     @property
     def payload_scale(self):
-        """Payload in parts of that of the arm that the mode shapes are made for [-]."""
+        """Payload relative to that of the arm for which the mode shapes are made [-]."""
         return self.origin[1]
 
     def _carrying(self, scale, model):
@@ -234,20 +235,20 @@ class ArmModel(ABC):
         Raises
         ------
         ModelError
-            Where the model takes no other payload.
+            If the model can't take another payload.
         """
         problem = "takes no other payload than its arm file's"
         raise ModelError(problem, field=f"model {self.arm.model}")
 
     def fuller(self, modes, stiffens=False, finite_slope=False):
-        """A model of the same arm that knows more of it, kept; itself where there is no more to know.
+        """A more detailed model of the same arm, kept for later calls; the model itself if there is nothing to add.
 
         Parameters
         ----------
         modes : int
-            In every flexible direction. An arm of which fewer frequencies were measured has as many as it can.
+            Number in every flexible direction. If fewer frequencies were measured, the arm has as many as it can.
         stiffens, finite_slope : bool
-            Whether links keep their length, and their slopes may be large, see `levels`; of a chain alone.
+            Whether links keep their length, and whether their slopes may be large, see `levels`; for a chain only.
 
         Returns
         -------
@@ -264,13 +265,14 @@ class ArmModel(ABC):
     def friction(self, qd, delta=None, delta_d=None):
         """Friction torque of the joints, shape (n,) [N m], see `Friction`.
 
-        Without the deflections `delta` and `delta_d`, without the part that grows with the transmitted torque.
+        If the deflections `delta` and `delta_d` are not given, the part that grows with the transmitted torque is left
+        out.
         """
         viscous, coulomb, smoothing = self._friction.T
         return viscous * qd + coulomb * np.tanh(qd / smoothing)
 
     def derivative(self, state, torque):
-        """Time derivative of the state (q, delta, qd, delta_d): the form (6), ready for scipy.
+        """Time derivative of the state (q, delta, qd, delta_d) in the form (6), ready for scipy.
 
         Parameters
         ----------
@@ -315,7 +317,7 @@ class ArmModel(ABC):
         Parameters
         ----------
         q : ndarray, shape (n,), optional
-            Where; zero if not given.
+            Joint angles; zero if not given.
         locked : bool
             Joints locked, or free (rigid-body motions, of frequency zero, are left out).
 
@@ -324,7 +326,7 @@ class ArmModel(ABC):
         omega : ndarray, shape (m,)
             Ascending [rad/s].
         shapes : ndarray, shape (n + m, m)
-            (q, delta) of each, of unit modal mass.
+            (q, delta) of each mode, of unit modal mass.
         """
         n, m = self.n_joints, self.n_modes
         q = np.zeros(n) if q is None else np.asarray(q, float)
@@ -332,7 +334,7 @@ class ArmModel(ABC):
         give = np.zeros((n, m))  # how the joints follow the modes
         if not locked:
             give = -np.linalg.solve(M[:n, :n], M[:n, n:])
-        # Joints free: what is left of the modal inertia once the joints give way.
+        # Joints free: the modal inertia that is left when the joints give way.
         mass = M[n:, n:] + M[n:, :n] @ give
         squares, vectors = eigh(K, 0.5 * (mass + mass.T)) if m else (np.zeros(0), np.zeros((0, 0)))
         return np.sqrt(np.maximum(squares, 0.0)), np.vstack([give @ vectors, vectors])
@@ -342,11 +344,11 @@ class ArmModel(ABC):
         return self.normal_modes(q, locked)[0]
 
     def without_play(self):
-        """The same model with all play closed; itself where there is none."""
+        """The same model with all play closed; the model itself if it has no play."""
         return self
 
     def transmission_rates(self):
-        """How fast the fastest transmission is, of all and of those with play [rad/s]; 0 where there is none."""
+        """Rate of the fastest transmission, among all and among those with play [rad/s]; 0 if there is none."""
         return 0.0, 0.0
 
     def static_deflection(self, q):
@@ -355,7 +357,7 @@ class ArmModel(ABC):
         Raises
         ------
         ModelError
-            When there is none near the straight arm: it buckles or folds under its own weight.
+            If there are none near the straight arm: it buckles or folds under its own weight.
         """
         return self._rest(q)
 
@@ -401,17 +403,17 @@ class Stepper:
     step, trajectory : callable
         Compiled functions of `kernels`.
     arguments : tuple
-        What they take after the number of substeps, but for friction and data.
+        Their arguments after the number of substeps, except friction and data.
     data : object
         What the right-hand side needs.
     lock : callable, optional
-        ``lock(mask)``: hold the joints of a boolean mask (n,) where they are, until the next call; they have to be
-        at rest, and their torque zero.
+        ``lock(mask)``: hold the joints of a boolean mask (n,) where they are, until the next call. They have to be at
+        rest, with zero torque.
 
     Attributes
     ----------
     friction : ndarray, shape (n, 3)
-        Taken where a call names none.
+        Used if a call gives none.
     """
 
     def __init__(self, model, step, trajectory, arguments, data, lock=None):
@@ -433,11 +435,11 @@ class Stepper:
         step : float
             Length of a substep [s].
         substeps : int
-            How many.
+            Number of substeps.
         friction : ndarray, shape (n, 3), optional
             As `ArmModel.friction_table`, which is the default.
         change : ndarray, shape (n,), optional
-            What the torque changes by until the end, linearly; nothing if not given [N m].
+            Linear change of the torque until the end; zero if not given [N m].
         """
         change = self._none if change is None else change
         friction = self.friction if friction is None else friction
@@ -453,7 +455,7 @@ class Stepper:
         starts, ends : ndarray, shape (s, n)
             Torque at both ends of each interval; linear between [N m].
         step, substeps, friction
-            As for a call.
+            As for `__call__`.
         """
         friction = self.friction if friction is None else friction
         self._trajectory(
@@ -503,7 +505,7 @@ def copy(model):
 
 
 def made(arm, payload_scale):
-    """The model of an arm with a payload in parts of the arm's, as `ArmModel.origin` has both."""
+    """The model of an arm with its payload scaled; `ArmModel.origin` has both arguments."""
     model = build(arm)
     return model if payload_scale == 1.0 else model.with_payload(payload_scale)
 
@@ -544,7 +546,7 @@ def damping_matrix(M22, K, ratios):
     Raises
     ------
     ModelError
-        Where the stiffness is not positive definite.
+        If the stiffness is not positive definite.
     """
     m = K.shape[0]
     if not len(ratios):
@@ -556,4 +558,4 @@ def damping_matrix(M22, K, ratios):
         raise ModelError(problem, field="modal stiffness", value=value)
     left = M22 @ psi
     D = left @ np.diag(2.0 * zeta * np.sqrt(squares)) @ left.T
-    return 0.5 * (D + D.T)  # to the last bit: what is symmetric is one constant of recorded terms
+    return 0.5 * (D + D.T)  # to the last bit: two equal entries are one constant of recorded terms

@@ -2,8 +2,8 @@
 r"""The fully derived one-link arm: everything that the Lagrangian of the planar beam gives.
 
 The hub turns by q, the beam point at x moves to :math:`R(q)\,(x,\ y(x,t))` with
-:math:`y = \sum_i\phi_i(x/L)\delta_i`, the payload (mass M, inertia J about its centre of mass, d beyond the
-tip) turns with the tip's slope. To first order in the slope,
+:math:`y = \sum_i\phi_i(x/L)\delta_i`, and the payload (mass M, inertia J about its centre of mass, d beyond the tip)
+turns with the tip's slope. To first order in the slope,
 
 .. math::
     2T = I_0\dot q^2 + \int_0^L\rho A[(\dot y + x\dot q)^2 + y^2\dot q^2]dx
@@ -39,7 +39,7 @@ from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation
 
 SOURCES = (load.source(kernel), load.source(integrators))
 
-#: Cosine and sine of an angle that is no number, as numpy has them.
+#: Cosine and sine of an angle that is not a number, as in numpy.
 NOWHERE = (math.nan, math.nan)
 
 
@@ -76,7 +76,7 @@ class Coefficients:
 
 
 class OneLinkEquations(ArmModel):
-    """Evaluates the one-link equations for whatever coefficients a derivation gives.
+    """Evaluates the one-link equations for the coefficients of a derivation.
 
     Subclasses derive the coefficients: `OneLink` in full, `paper_appendix.PaperAppendix` as published.
 
@@ -84,7 +84,7 @@ class OneLinkEquations(ArmModel):
     ----------
     arm : Arm
     shapes : beam.ModeShapes, optional
-        Where they are not to be those of this arm's own payload.
+        Mode shapes; if not given, those of this arm's own payload.
     """
 
     def __init__(self, arm, shapes=None):

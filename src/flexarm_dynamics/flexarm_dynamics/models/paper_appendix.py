@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""The one-link model that Siciliano & Book publish in their appendix: misprints corrected, omissions kept.
 
-What is corrected, since the published formulas do not give the published numbers: the sign of :math:`\nu_i` in (A1);
-:math:`\phi_{ie}^2` in k11 and k22; the factor :math:`\dot\theta` in (A5);
-:math:`\phi_e' = \frac1L d\phi/d\xi`; :math:`\int\phi^2 = 1`.
+These are corrected, because the published formulas do not give the published numbers: the sign of :math:`\nu_i` in
+(A1); :math:`\phi_{ie}^2` in k11 and k22; the factor :math:`\dot\theta` in (A5); :math:`\phi_e' = \frac1L d\phi/d\xi`;
+:math:`\int\phi^2 = 1`.
 
-What the paper leaves out of its own Lagrangian, and this class with it:
+The paper leaves these terms out of its own Lagrangian, and so does this class:
 
 =============================================  ==========================================================
 omitted                                        effect on arm R

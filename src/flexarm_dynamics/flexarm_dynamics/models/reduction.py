@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arrays of a link given by reduced matrices (`arm.reduced`): from shapes at a mesh's nodes, and of a beam."""
+"""Makes the arrays of links given by reduced matrices (`arm.reduced`) from shapes at a mesh's nodes or from a beam."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def from_nodes(nodes, mass, shapes, stiffness, tip, tip_translation, tip_rotatio
     stiffness : array_like, shape (K, K)
         Modal stiffness.
     tip : array_like, shape (3,)
-        Where the next joint is [m].
+        Position of the next joint [m].
     tip_translation, tip_rotation : array_like, shape (K, 3)
         Displacement and rotation vector of the tip per unit of each mode.
 
@@ -69,11 +69,12 @@ def of_link(chain, name, stations=17):
     Parameters
     ----------
     chain : Chain
-        Above the first order for the second order; without bodies on that link, and without a root off its joint.
+        To include the second order, its level must be above the first. That link must have no bodies, and its root must
+        be at its joint.
     name : str
         Of the link.
     stations : int
-        Places along it for pictures.
+        Number of places along it, for pictures.
 
     Returns
     -------

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Mode shapes of a beam whose section changes along it, and which carries rigid bodies; clamped at its base.
+r"""Computes mode shapes of a beam that is clamped at its base, has a varying section and carries rigid bodies.
 
-The beam problem of :math:`EI(\xi)`, :math:`m(\xi)` by Rayleigh-Ritz: between two places where the section jumps or a
-body sits, a shape is a polynomial, and value and slope are continuous where two of them meet. So the curvature may
-jump where EI does, and the shear where a body is. In bending the trial functions of one span are
+Rayleigh-Ritz solves the beam problem of :math:`EI(\xi)`, :math:`m(\xi)`. Between two places where the section jumps or
+a body sits, a shape is a polynomial. Value and slope are continuous where two polynomials meet. So the curvature may
+jump where EI does, and the shear force at a body. In bending the trial functions of one span are
 
 .. math:: H_1 \ldots H_4, \qquad B_k(s) = \int\!\!\int P_k, \quad k = 2, 3, \ldots
 
@@ -24,7 +24,7 @@ from scipy.linalg import eigh
 
 from .beam import ModeShapes, _gauss_legendre
 
-#: Degree of the polynomials: at least, beyond what a half wave needs, and at most.
+#: Degree of the polynomials: the minimum, what each radian of the highest mode's wave adds, and the maximum.
 MIN_DEGREE, DEGREE_PER_WAVE, MAX_DEGREE = 14, 1.4, 80
 
 
@@ -166,7 +166,7 @@ class BeamProblem:
         degrees = self._degrees(modes)
         degree = max(degrees)
         K, M, rows = self._matrices(degrees)
-        # Of M v = mu K v the largest mu: the lowest modes have all digits.
+        # The largest mu of M v = mu K v belong to the lowest modes, which so keep all digits.
         _, vectors = eigh(M, K, subset_by_index=(len(M) - modes, len(M) - 1))
         vectors = vectors[:, ::-1]
         coefficients = np.zeros((len(degrees), degree + 1, modes))
@@ -176,7 +176,7 @@ class BeamProblem:
         return _normalised(self.breaks, coefficients, 1 if self.twist else 2)
 
     def _degrees(self, modes):
-        """Degree in each span: more where waves are shorter."""
+        """Degree in each span, higher where waves are shorter."""
         xi, w = spans(self.breaks, 16)
         slowness = (self.mass(xi) / self.stiffness(xi)) ** (0.5 if self.twist else 0.25)
         waves = (w * slowness).reshape(-1, 16).sum(axis=1) / (w @ slowness)
@@ -184,7 +184,7 @@ class BeamProblem:
         return [min(MAX_DEGREE, int(np.ceil(p))) for p in wanted]
 
     def _scaled_trial(self, span, degree):
-        """Trial functions of a span whose slopes are by xi."""
+        """Trial functions of a span, with slopes by xi."""
         trial = _trial(degree, self.twist)
         if self.twist:
             return trial
@@ -193,7 +193,7 @@ class BeamProblem:
         return trial
 
     def _matrices(self, degrees):
-        """Stiffness and mass matrix, and of each span the rows of its trial functions (-1: clamped)."""
+        """Stiffness and mass matrix, and for each span the rows of its trial functions (-1: clamped)."""
         ends = 1 if self.twist else 2
         shared = ends * (len(self.breaks) - 1)
         size = shared + sum(p + 1 - 2 * ends for p in degrees)

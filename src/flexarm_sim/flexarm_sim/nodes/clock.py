@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`/clock`: simulated time for nodes with `use_sim_time`, unless another node publishes it."""
+"""Publishes `/clock`, simulated time for nodes with `use_sim_time`, unless another node publishes it."""
 
 from rosgraph_msgs.msg import Clock as Message
 
@@ -9,12 +9,12 @@ from flexarm_ros.messages import set_stamp
 
 PARAMETERS = (
     parameter("clock_rate", 100.0, "Hz", 0.0, 20000.0, read_only=True).described(
-        "Rate of /clock, in simulated time; at most the control rate. It is published unless another node does so; of"
-        " several simulators, the first by name does. 0: never."
+        "Rate of /clock, in simulated time; at most the control rate. It is published unless another node publishes"
+        " it; of several simulators, the first by name publishes. 0: never."
     ),
 )
 TOPIC = "/clock"
-#: Between two looks for other publishers [s].
+#: Time between two checks for other publishers [s].
 LOOK = 1.0
 ARM_STATE = "flexarm_msgs/msg/ArmState"
 
@@ -38,14 +38,14 @@ class Clock:
         node.make_timer(LOOK, self.look)
 
     def publish(self, stamp_ns, first):
-        """Publish a stamp [ns] where it is due and is read; `first` of a session: time may have gone back."""
+        """Publish a stamp [ns] if it is due and has subscribers; `first` of a session: time may have gone back."""
         due = self._due(stamp_ns, first) and not self._silent
         if due and self._publisher.get_subscription_count():
             set_stamp(self._message.clock, stamp_ns)
             self._publisher.publish(self._message)
 
     def look(self):
-        """Look who else publishes the clock."""
+        """Check which other nodes publish the clock."""
         node = self._node
         own = node.get_namespace(), node.get_name()
         ends = node.get_publishers_info_by_topic(TOPIC)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parameter `faults` of the simulator node, and the messages that it changes."""
+"""Handles the parameter `faults` of the simulator node, and the messages that it changes."""
 
 from array import array
 
@@ -15,7 +15,7 @@ from ..fault_injector import FIELDS, FaultInjector, Sample
 
 PARAMETERS = (
     parameter("allow_faults", False, read_only=True).described(
-        "Whether `faults` may be set: for tests of what comes after the simulator."
+        "Whether `faults` may be set, for tests of the nodes behind the simulator."
     ),
     parameter("faults", [], kind="string_array").described(
         'Faults put into arm_state, each "SIGNAL KIND [key=value ...]": docs/fault_injection.md.'
@@ -57,7 +57,7 @@ class Faults:
         self.restarted, self._restarts = False, 0
 
     def allowed(self, lines):
-        """The lines, where faults are allowed."""
+        """The lines, if faults are allowed."""
         if lines and not self._parameters["allow_faults"]:
             hint = "start the simulator with allow_faults:=true to set them"
             raise ParameterError("not allowed", field="faults", hint=hint)
@@ -69,7 +69,7 @@ class Faults:
         self.restarted, self._restarts = False, 0
 
     def outgoing(self, message, time):
-        """The messages to publish for a true one: that one, or what the faults make of it.
+        """The messages to publish for a true one: the true one, or what the faults make of it.
 
         `time` is that since the start of the session [s].
         """
@@ -105,7 +105,7 @@ def check(faults, parameters):
 
 
 def _message(true, sample, later):
-    """A new `ArmState` with the values of a faulty sample, of a session so much `later` than the true one's."""
+    """A new `ArmState` with the values of a faulty sample, and a session number larger by `later` than the true one."""
     session = (true.session + later) % 2**32
     message = ArmState(session=session, sequence=sample.sequence)
     message.controller_id, message.trust, message.doubt = (

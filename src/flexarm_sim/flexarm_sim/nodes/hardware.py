@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Node `hardware`: the simulated arm behind drives, as the hardware of somebody else's controllers.
+"""Node `hardware`: the simulated arm behind drives, as the hardware of third-party controllers.
 
-It takes and gives `sensor_msgs/JointState`, as ``joint_state_topic_hardware_interface`` of ros2_control has them: a
-mock hardware whose links bend, with faults on purpose.
+It receives and publishes `sensor_msgs/JointState` as ``joint_state_topic_hardware_interface`` of ros2_control needs
+them. It is a mock hardware whose links bend, and whose faults are chosen.
 """
 
 import time
@@ -26,17 +26,17 @@ from . import faults
 
 OWN = (
     parameter("joint_commands_topic", "robot_joint_commands", read_only=True).described(
-        "Topic of the commands, as the parameter of that name of joint_state_topic_hardware_interface."
+        "Topic of the commands, as the parameter of the same name of joint_state_topic_hardware_interface."
     ),
     parameter("joint_states_topic", "robot_joint_states", read_only=True).described(
         "Topic of the states, likewise."
     ),
     parameter("lockstep", False, read_only=True).described(
-        "One period of the commands per command, as fast as they come; false: real time."
+        "Advance by one command period per command, as fast as commands come; false: real time."
     ),
 )
 PARAMETERS = (*simulator.PARAMETERS, *position_loop.PARAMETERS, *faults.PARAMETERS, *OWN)
-#: Real time that was lost is not caught up beyond this [s].
+#: Lost real time is caught up at most by this [s].
 BEHIND = 0.1
 
 
@@ -129,7 +129,7 @@ class HardwareNode(ArmNode):
     # States out --------------------------------------------------------------------------------
 
     def _on_period(self):
-        """Real time: as many periods as have passed, within reason."""
+        """Real time: advance by as many periods as have passed, as far as `BEHIND` allows."""
         if not self.active:
             return
         now, period = time.monotonic(), self._samples * 1e-9 * self.sim.period_ns
@@ -139,7 +139,7 @@ class HardwareNode(ArmNode):
             self._advance()
 
     def _advance(self):
-        """One period of the commands, and the state after it."""
+        """Advance by one period of the commands, and publish the state after it."""
         for _ in range(self._samples):
             self.sim.advance_with(self.drives.drive)
         self._publish()

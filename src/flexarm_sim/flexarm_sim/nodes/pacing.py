@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When the simulated arm advances by a period: on the grid of real time, or in lockstep with the controller."""
+"""Decides when the simulated arm advances by a period: on the grid of real time, or in lockstep with the controller."""
 
 from flexarm_dynamics.parameters import parameter
 from flexarm_ros.torque_gate import TorqueGate
 
-#: In lockstep, two controllers that sent in turn are one again after this many samples of silence.
+#: In lockstep, after two controllers sent in turn, one is alone again after this many samples of the other's silence.
 ALONE_SAMPLES = 100
 #: In lockstep, periods without a message that are run before other calls are served.
 AT_ONCE = 200
@@ -13,14 +13,14 @@ UNANSWERED = 5.0
 
 PARAMETERS = (
     parameter("lockstep", False, read_only=True).described(
-        "One period per torque that answers the last state, as fast as the machine goes; false: real time."
+        "Advance by one period per torque that answers the last state, as fast as the machine allows; false: real time."
     ),
     parameter("pause_at", 0.0, "s", -1.0, 1e6).described(
         "In lockstep, pause at this simulated time, once, until `~/pause` is called with data false;"
         " negative, or a time that is past: never."
     ),
     parameter("resend_period", 0.1, "s", 0.01, 10.0, read_only=True).described(
-        "In lockstep or paused, the state is sent again after so long without an answer (wall time)."
+        "In lockstep or paused: time without an answer after which the state is sent again (wall time)."
     ),
     parameter("real_time_factor", 1.0, "-", 0.001, 100.0, read_only=True).described(
         "In real time: seconds simulated per second of wall time."
@@ -54,7 +54,7 @@ class RealTime:
         self.late = 0
 
     def alone(self):
-        """Silence of one controller after which the other is alone, see `TorqueGate`; in simulated time [s]."""
+        """Silence of one controller after which the other one is alone, see `TorqueGate`; in simulated time [s]."""
         return TorqueGate.ALONE
 
     def connect(self, torques):
@@ -74,7 +74,7 @@ class RealTime:
             node.report("no fresh torque: the safe action is applied")
 
     def set_pause(self, time):
-        """Nothing to do: real time stands only on request."""
+        """Nothing to do: real time pauses only on request."""
 
     def pauses_at(self, sequence):
         """Whether a pause begins at this sample."""
@@ -93,7 +93,7 @@ class RealTime:
 
 
 class Lockstep:
-    """Advances by one period for each torque that answers the newest state, as fast as the machine goes.
+    """Advances by one period for each torque that answers the newest state, as fast as the machine allows.
 
     Parameters
     ----------
@@ -125,10 +125,10 @@ class Lockstep:
         return sequence == self._pause
 
     def answered(self, message):
-        """Advance when the message answers the state that is waited for.
+        """Advance when the message answers the awaited state.
 
-        Answers to a state that was sent again are ignored. So is every answer during a pause: after it the
-        state is sent again, and answered from the controller's cache.
+        Answers to a state that was sent again are ignored. So is every answer during a pause: after the pause the state
+        is sent again, and the controller answers from its cache.
         """
         node = self._node
         waited = message.session == node.gate.session and message.sequence == node.awaited

@@ -22,7 +22,7 @@ class SimulatorNode(Driver):
     sent : list of ArmState
         Messages of the present sample: one, or what the faults make of it.
     awaited : int or None
-        Sequence of the state whose answer is waited for; None: no message was sent for this sample.
+        Sequence of the state whose answer is awaited; None: no message was sent for this sample.
     """
 
     def __init__(self):
@@ -56,7 +56,7 @@ class SimulatorNode(Driver):
 
     def make_gate(self):
         samples = max(1, round(self.parameters["torque_timeout"] * self.parameters["rate"]))
-        # Counted in samples; half of one more, so that rounding does not decide.
+        # Counted in samples, plus half a sample so that rounding does not decide.
         return TorqueGate(self.arm, (samples + 0.5) * self.period, self.pacing.alone())
 
     def connect(self, torques):
@@ -103,7 +103,7 @@ class SimulatorNode(Driver):
         self.pacing.answered(message)
 
     def refused(self, reason):
-        """Log what can't be used; DISABLED, and answers to states sent again, are in order here."""
+        """Log that a message can't be used; DISABLED, and answers to states sent again, are normal here."""
         if reason == self.gate.reason != self.gate.DISABLED:
             self.report(f"{reason}: the safe action is applied")
 
@@ -131,7 +131,7 @@ class SimulatorNode(Driver):
         if self.faults.restarted:
             self.gate.begin((self.gate.session + 1) % WRAP)
         self.send()
-        # The newest of several: the others are of the samples before it.
+        # The newest of several: the others belong to earlier samples.
         self.awaited = max((m.sequence for m in self.sent if self._is_own(m)), default=None)
         self.publish_joints(sample)
         if self.clock is not None:
@@ -156,7 +156,7 @@ class SimulatorNode(Driver):
     # Services, diagnostics ---------------------------------------------------------------------
 
     def reset(self):
-        """Start again at sample 0 of a new session; its number."""
+        """Start again at sample 0 of a new session; return the number of the session."""
         self.sim.reset()
         self.gate.begin((self.gate.session + 1) % WRAP)
         self.faults.reset()
@@ -167,7 +167,7 @@ class SimulatorNode(Driver):
         return self.gate.session
 
     def pause(self, paused):
-        """Pause or go on; whether that was possible, and a sentence for the caller."""
+        """Pause or go on; return whether that was possible, and a sentence for the caller."""
         if self.fault and not paused:
             return False, f"call ~/reset first: {self.fault}"
         self.paused = paused

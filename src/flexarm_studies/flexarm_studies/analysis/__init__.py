@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm analyze``: what follows from a design before the arm moves. One topic per module, no ROS.
+"""``flexarm analyze``: computes what follows from a design before the arm moves. One topic per module, no ROS.
 
-`scales`: time scales and reachability; `bound`: how large mu may be; `margins`: what the loop withstands;
-`attraction`: from how far off it comes back; `monte_carlo`: many runs of arms that differ from the model.
+`scales`: time scales and reachability; `bound`: how large mu may be; `margins`: what the loop withstands; `attraction`:
+offsets from which it comes back; `monte_carlo`: many runs of arms that differ from the model.
 """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From how far off the nonlinear loop brings the arm back to rest, with its torque limits, sensors and observer.
+"""Finds how far off rest the nonlinear loop still brings the arm back, with its torque limits, sensors and observer.
 
-The loop starts with a joint away from where it is to be held, or with the arm bent. Bisection finds the largest offset
-from which the arm comes back. The result is a few rays into the domain of attraction, not the whole domain.
+The loop starts with a joint away from its goal, or with the arm bent. Bisection finds the largest offset from which the
+arm comes back. The result is a few rays into the domain of attraction, not the whole domain.
 """
 
 from dataclasses import replace
@@ -78,15 +78,15 @@ def comes_back(case, joint, bend, watched):
     late = record.time > record.time[-1] - LATE
     off = np.abs(record.plant_position - q).max(1)
     bent = np.abs(record.plant_amplitude[:, modes] - rest).max(1, initial=0.0)
-    # Each by its own peak: a small bending may turn the joint far on the way back.
+    # Each is judged by its own peak: a small bending may turn the joint far on the way back.
     return all(bool(v[late].max() < max(BACK * v.max(), FLOOR)) for v in (off, bent))
 
 
 def study(case, steps=5, progress=None):
-    """Largest scale along each ray from which the arm comes back, by so many `steps` of bisection.
+    """Largest scale along each ray from which the arm comes back, by this number of `steps` of bisection.
 
     Returns ``reason``; ``rays``: ``direction``, ``scale`` (of joint error, or tip deflection), ``unit``, and
-    ``searched``, the largest one tried. The scale is equal to it where the arm came back even from there.
+    ``searched``, the largest scale tried. If the arm came back even from there, the scale is equal to it.
     """
     if case.without_poles:
         return {"reason": case.without_poles, "rays": []}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How large mu may be: the composite Lyapunov function of Saberi and Khalil, on the loop as designed.
+r"""Computes how large mu may be, by the composite Lyapunov function of Saberi and Khalil, for the loop as designed.
 
 The closed loop, continuous and linear about rest at the motion's end, in slow error x = (q, qd) and fast deviation
 y = z_f, reads without any approximation
@@ -8,10 +8,10 @@ y = z_f, reads without any approximation
     \dot x &= A_{11}x + A_{12}y, \\
     \dot y &= A_{21}x + \left(\tfrac{\mu}{\varepsilon}A_f + R\right)y, \qquad A_f = A_2 + B_2K_f,
 
-at epsilon = mu: A_f is the boundary layer (11) under its control, R what else moves y. Slower bending is a larger
-epsilon. With :math:`A_{11}^TP_1 + P_1A_{11} = -S_1^TS_1`, :math:`A_f^TP_2 + P_2A_f = -S_2^TS_2` and the composite
-function :math:`\nu = (1-d)x^TP_1x + d\,y^TP_2y`, theorem 1 of Saberi & Khalil (1984) (Kokotovic, Khalil & O'Reilly
-1986, theorem 7.5.1 there; Khalil, Nonlinear Systems, theorem 11.3) asks for
+at epsilon = mu: A_f is the boundary layer (11) under its control, R contains everything else that moves y. Slower
+bending is a larger epsilon. With :math:`A_{11}^TP_1 + P_1A_{11} = -S_1^TS_1`, :math:`A_f^TP_2 + P_2A_f = -S_2^TS_2` and
+the composite function :math:`\nu = (1-d)x^TP_1x + d\,y^TP_2y`, theorem 1 of Saberi & Khalil (1984) (Kokotovic, Khalil &
+O'Reilly 1986, theorem 7.5.1 there; Khalil, Nonlinear Systems, theorem 11.3) requires
 
 .. math::
     \dot V|_{y=0} \le -\alpha_1\psi_1^2, \quad \dot W|_{layer} \le -\alpha_2\psi_2^2, \quad
@@ -32,7 +32,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import matrix_balance, solve_continuous_lyapunov
 
-# Not `solve_triangular`: its threads take ten times as long as the arithmetic on matrices of this size.
+# Not `solve_triangular`: for matrices of this size its threads take ten times as long as the arithmetic.
 from scipy.linalg.blas import dtrsm
 from scipy.optimize import minimize
 
@@ -45,7 +45,7 @@ from ..loop import scenario as scenarios
 from . import case as cases
 from . import trial
 
-#: Largest factor of mu that is tried: bending that is this much slower [-].
+#: Largest factor of mu that is tried: bending slower by this factor [-].
 MAX_FACTOR = 30.0
 #: Runs are made this fraction below and above the limit [-].
 BESIDE = 0.15
@@ -67,7 +67,7 @@ class Blocks:
 
 
 def blocks(case):
-    """The case's loop as `Blocks`; refused for a fast law with states, and for an arm without modes."""
+    """The case's loop as `Blocks`; a fast law with states, and an arm without modes, are refused."""
     model, law, q = case.model, case.law, case.q
     n, m = model.n_joints, model.n_modes
     K = law.fast.gain(q)
@@ -112,9 +112,9 @@ def constants(b, S1, S2):
 
 
 def optimised(b, evaluations=2500):
-    """`constants` with the largest bound that a search over the weights finds, in about so many `evaluations`.
+    """`constants` with the largest bound that a search over the weights finds, in about this number of `evaluations`.
 
-    `b` are the `Blocks`; where the slow or the fast part alone is unstable the theorem does not apply: a DesignError.
+    `b` are the `Blocks`. If the slow or the fast part alone is unstable, the theorem does not apply: a DesignError.
     """
     for name, A in (("slow", b.A11), ("fast", b.A_f)):
         worst = np.linalg.eigvals(A).real.max()
@@ -135,7 +135,7 @@ def optimised(b, evaluations=2500):
     best = None
     for start in _starts(b):
         p = start
-        # Norms have kinks, where a search along gradients stops: it is restarted from there.
+        # Norms have kinks at which a search along gradients stops: it is restarted from there.
         left, before = evaluations // 2, math.inf
         while left > 0:
             found = minimize(cost, p, method="L-BFGS-B", options={"maxfun": left, "maxiter": 200})
@@ -157,7 +157,7 @@ def _triangular(p, size):
 
 
 def _starts(b):
-    """First weights: balanced units, and units in which the parts are as near to normal matrices as possible."""
+    """First weights: balanced units, and units in which the parts are as close to normal matrices as possible."""
     for near in (_balanced, _modal):
         yield np.concatenate([_parameters(near(b.A11)), _parameters(near(b.A_f))])
 
@@ -224,12 +224,12 @@ def simulated(case, factor):
 
 
 def study(case, mu, quick=False):
-    """The bound, and the mu at which the loop in fact becomes unstable; if `quick` by a shorter search, without runs.
+    """The bound, and the mu at which the loop in fact becomes unstable; if `quick`, by a shorter search, without runs.
 
-    Returns ``mu``, that of the design; ``bound``, a mu, and its constants; ``linear_limit`` and ``redesign_limit``, mu
-    where the linear family and the redesigned loop lose stability (None: not up to ``searched``; mu itself: the design
-    is unstable); ``simulated``, whether nonlinear runs on either side of the latter are stable; or ``reason``, why
-    there is no bound.
+    Returns ``mu`` of the design; ``bound``, a mu, and its constants; ``linear_limit`` and ``redesign_limit``, the mu at
+    which the linear family and the redesigned loop lose stability (None: not up to ``searched``; mu itself: the design
+    is unstable); and ``simulated``, whether nonlinear runs on either side of the latter are stable. Without a bound, it
+    returns ``reason``.
     """
     found = {"mu": mu, "searched": MAX_FACTOR * mu}
     reason = case.without_poles

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The case under analysis: an arm, its controller as designed, and the motion that it is for."""
+"""Describes the case under analysis: an arm, its controller as designed, and the motion for which it is designed."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -21,12 +21,12 @@ ALONG = 21
 
 @dataclass(frozen=True)
 class Case:
-    """A design and the motion that it is for.
+    """A design and the motion for which it is made.
 
     Attributes
     ----------
     scenario : Scenario
-        With `UNCHECKED`, so that its design is not refused for its poles.
+        With `UNCHECKED`, so its design is not refused because of its poles.
     model : ArmModel
     law : CompositeControl
     period : float
@@ -47,7 +47,7 @@ class Case:
 
     @property
     def q(self):
-        """The motion's end, where the loop is linearised, shape (n,) [rad]."""
+        """End of the motion, where the loop is linearised, shape (n,) [rad]."""
         return self.positions[-1]
 
     @property
@@ -77,7 +77,7 @@ class Case:
         delay, period : float
             [s]
         gain : float
-            Of the torque on its way to the arm [-].
+            Factor of the torque on its way to the arm [-].
         """
         met = None if plant is None else model.build(plant)
         return full_order.poles(self.law, self.q, period or self.period, delay, met, gain)
@@ -88,7 +88,7 @@ class Case:
 
 
 def unchecked(scenario):
-    """The scenario, with a design that is not refused for its poles."""
+    """The scenario, with a design that is not refused because of its poles."""
     return replace(scenario, controller=scenario.controller | {"stability_margin": UNCHECKED})
 
 
@@ -148,7 +148,7 @@ def slower_bending(scenario, factor):
 
 
 def first_loss(stable, start, end, scan=12, steps=20):
-    """Where a loop that is stable at `start` becomes unstable first, on the way to `end`; bisection after a scan.
+    """Find where a loop that is stable at `start` first becomes unstable towards `end`, by a scan and bisection.
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm analyze``: time scales, the bound on mu, margins, domain of attraction, Monte Carlo of a design."""
+"""``flexarm analyze``: computes time scales, bound on mu, margins, domain of attraction, Monte Carlo of a design."""
 
 import json
 import sys
@@ -151,7 +151,7 @@ def _bound(case, quick):
 
 
 def _or_reason(study, *arguments, **empty):
-    """A part of the analysis; where the arm or the control allows none, only the ``reason``, and what is `empty`."""
+    """A part of the analysis; if arm or control does not allow it, only the ``reason`` and the `empty` entries."""
     try:
         return study(*arguments)
     except (FlexarmError, np.linalg.LinAlgError) as error:

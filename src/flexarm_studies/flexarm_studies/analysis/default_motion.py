@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A motion for an arm for which none is given: from rest to rest, within its limits of position, speed and torque."""
+"""Chooses a motion if none is given: from rest to rest, within the arm's limits of position, speed and torque."""
 
 import numpy as np
 from scipy.optimize import minimize
@@ -8,30 +8,31 @@ from flexarm_control.trajectory import refuse_torque, specs
 from flexarm_dynamics.errors import FlexarmError, TrajectoryError
 from flexarm_dynamics.linear import static_torque
 
-#: The motion of the paper, which is taken where the arm can do it.
+#: The motion of the paper; it is taken if the arm can do it.
 PAPER = "paper"
-#: Largest turn of a joint [rad], and duration that is tried first [s]; then twice as long, or half as far, so often.
+#: First turn of a joint [rad], and first duration [s]; number of durations, each twice the last, and of turns, each
+#: half the last.
 TURN, DURATION, LONGER, SHORTER = 1.0, 2.0, 4, 5
-#: Points of a motion that are looked at, places at which the arm has to rest, and the fraction of the torque limit that
-#: its weight may take there [-].
+#: Number of points of a motion that are checked, number of places at which the arm must be able to rest, and fraction
+#: of the torque limit that its weight may take there [-].
 POINTS, PLACES, HOLDING = 41, 5, 0.9
 #: Joints without limits stay within this of zero [rad].
 WORKSPACE = np.pi
 
 
 def default_motion(model, design=None):
-    """A motion as text for `specs.from_spec`, which begins straight, where the control is designed, or hanging.
+    """A motion as text for `specs.from_spec`; the arm begins straight, where the control is designed, or hanging.
 
     Parameters
     ----------
     model : ArmModel
     design : (n,) array_like, optional
-        Configuration that the control is designed for [rad].
+        Configuration for which the control is designed [rad].
 
     Raises
     ------
     TrajectoryError
-        Where no motion from there is within the limits.
+        If no motion from these is within the limits.
     """
     if _works(model, PAPER):
         return PAPER
@@ -59,7 +60,7 @@ def default_motion(model, design=None):
 
 
 def _works(model, text):
-    """Whether the arm can do a motion, and rests along it with torque to spare."""
+    """Whether the arm can do a motion, and can rest along it with torque in reserve."""
     try:
         motion = specs.from_spec(f"{text}{',' if ':' in text else ':'}points={POINTS}", model)
         limit = model.arm.torque_limits
@@ -76,7 +77,7 @@ def _works(model, text):
 
 
 def _hanging(model, low, high):
-    """Where the rigid arm hangs lowest within its limits, shape (n,) [rad]."""
+    """Configuration in which the rigid arm hangs lowest within its limits, shape (n,) [rad]."""
     straight = np.zeros(model.n_modes)
     found = [
         minimize(
@@ -86,7 +87,7 @@ def _hanging(model, low, high):
         )
         for start in (np.clip(0.0, low, high), low, high)
     ]
-    # The first of those that hang as low: a joint that the weight does not turn stays at zero.
+    # The first of equally low ones: a joint that the weight does not turn stays at zero.
     lowest = min(one.fun for one in found)
     best = next(one for one in found if one.fun <= lowest + 1e-6 * max(abs(lowest), 1.0)).x
     return np.clip(best, low + 0.02 * (high - low), high - 0.02 * (high - low))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of an analysis: mu along the motion, poles over the slow gain, the bound on mu, quantiles."""
+"""Draws the figures of an analysis: mu along the motion, poles over the slow gain, the bound on mu, quantiles."""
 
 from pathlib import Path
 
@@ -9,14 +9,14 @@ from ..plotting import COMPOSITE, REFERENCE, SLOW, STYLE, plt, save
 
 
 def draw(found, directory):
-    """Write the figures that the analysis has something for; their paths.
+    """Write the figures for which the analysis has data; return their paths.
 
     Parameters
     ----------
     found : dict
         As `command.study` returns it.
     directory : Path
-        Made if it is not there.
+        Made if it does not exist.
     """
     made, parts = (
         [],

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Margins: the delay, drive gain, payload, stiffness and lower rate that the loop withstands; its noise at rest.
+"""Computes margins: the delay, drive gain, payload, stiffness and lower rate that the loop withstands; noise at rest.
 
-A margin is where the sampled full-order loop with full state, linearised at the motion's end, loses stability:
-`full_order.closed_loop`, by bisection. The observer is not part of it. With runs, the nonlinear loop with its
-observer is tried at 0.9 and 1.1 times the margin; if its own margin is elsewhere, bisection by runs finds it.
+A margin is the value at which the sampled full-order loop with full state, linearised at the motion's end, loses
+stability (`full_order.closed_loop`, by bisection). The observer is not part of it. With runs, the nonlinear loop with
+its observer is tried at 0.9 and 1.1 times the margin; if the margin of this loop is elsewhere, bisection by runs finds
+it.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from ..loop.metrics import tip_path
 from . import case as cases
 from . import trial
 
-#: How long the arm is held to judge noise, and the first part that is left out [s].
+#: Duration for which the arm is held to judge noise, and its first part that is left out [s].
 HELD, SETTLING = 3.0, 1.0
 #: Number of bisections by runs, and the largest multiple of the margin that they try [-].
 RUNS, MAX_MULTIPLE = 4, 1.5
@@ -83,10 +84,10 @@ TRIED = ("delay", "gain_high")
 
 
 def study(case, runs=True, tried=TRIED, progress=None):
-    """All margins; with `runs`, nonlinear runs confirm those of `tried`, and noise is judged.
+    """All margins. With `runs`, nonlinear runs confirm those of `tried`, and noise is judged.
 
-    Returns ``reason``; ``decay_per_s``; per margin ``value`` (None: none up to ``searched``) and, where tried,
-    ``confirmed`` and ``simulated``; ``plants``: how fast the loop dies out on other arms; ``noise``.
+    Returns ``reason``; ``decay_per_s``; per margin ``value`` (None: none up to ``searched``) and, if tried,
+    ``confirmed`` and ``simulated``; ``plants``: decay rate of the loop on other arms; ``noise``.
     """
     if case.without_poles:
         return {"reason": case.without_poles, "stable": None}
@@ -110,7 +111,7 @@ def study(case, runs=True, tried=TRIED, progress=None):
 
 
 def _decay(case, arm):
-    """As `Case.decay` of another arm; None where that does not rest."""
+    """As `Case.decay` for another arm; None if that arm does not rest."""
     try:
         return case.decay(plant=arm)
     except FlexarmError:
@@ -141,7 +142,7 @@ def by_runs(case, kind, value):
     """Check a margin by nonlinear runs; `kind` is the `Margin`, `value` that of the linear loop.
 
     Returns ``confirmed``: stable at 0.9 and unstable at 1.1 of the margin (of its logarithm for factors);
-    ``simulated``: the margin of the loop with its observer where it differs, else None; ``at_least``: whether that is
+    ``simulated``: the margin of the loop with its observer if it differs, otherwise None; ``at_least``: whether that is
     only the largest value tried.
     """
     unstable = kind.poles(case, _beside(kind, value, 1.02))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Monte Carlo: many runs of arms that differ from the control model in payload, stiffness, damping, delay and noise.
+"""Monte Carlo: runs many arms that differ from the control model in payload, stiffness, damping, delay and noise.
 
 Sample i is drawn from ``SeedSequence(seed, spawn_key=(i,))`` alone, and its run is the same to the last bit on any
 worker: neither the number of workers nor an interruption changes a result. With a directory, results are appended to a
@@ -42,7 +42,7 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 @dataclass(frozen=True)
 class Specification:
-    """What is drawn and run: plain data, stored in the file's first line.
+    """Specification of what is drawn and run: plain data, stored in the file's first line.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Specification:
     ranges : dict
         Name to (low, high).
     files : dict
-        Digest of each arm file, so that a changed one is noticed.
+        Digest of each arm file, so a changed file is noticed.
     """
 
     scenario: dict
@@ -79,8 +79,8 @@ def draw(spec, number):
 def sample(spec, number):
     """Run sample `number` of the specification `spec`; also called in other processes.
 
-    Returns ``sample``, ``drawn``, and ``metrics`` with `METRICS`, ``lost``, ``reason``; of metrics per joint the
-    largest. A refused run counts as lost, with its error as the reason.
+    Returns ``sample``, ``drawn``, and ``metrics`` with `METRICS`, ``lost``, ``reason``; a metric per joint is replaced
+    by its largest value. A refused run counts as lost, with its error as the reason.
     """
     drawn = draw(spec, number)
     try:
@@ -107,7 +107,7 @@ def run(spec, count, directory=None, workers=None, scheduler=None, progress=None
     directory : str or Path, optional
         For the file of results.
     workers : int, optional
-        Number of processes; one per core if not given. 1: everything in this process.
+        Number of processes; one per core if not given. 1: all in this process.
     scheduler : str, optional
         As for `workers.results`.
     progress : Progress, optional
@@ -120,7 +120,7 @@ def run(spec, count, directory=None, workers=None, scheduler=None, progress=None
     Raises
     ------
     FlexarmError
-        For a file of another specification, and where Dask is not installed or its scheduler can't be reached.
+        For a file of another specification, and if Dask is not installed or its scheduler can't be reached.
     """
     at_least("--monte-carlo", count, 1)
     keep = Store(None if directory is None else Path(directory) / FILE, spec)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The text of an analysis, for a terminal."""
+"""Writes the text of an analysis for a terminal."""
 
 from flexarm_control.robust.limit_cycle import LimitCycle
 from flexarm_control.robust.verdict import Bears

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time scales: mu, spectra of the slow and fast subsystems, and reachability by the torques, over the workspace.
+"""Computes time scales over the workspace: mu, spectra of slow and fast subsystem, and reachability by the torques.
 
 mu is the paper's estimate: the highest frequency of the slow subsystem under its control, divided by the smallest
 frequency of the boundary layer (11) without control.
@@ -56,7 +56,7 @@ def at(case, q, qd, slow):
         raise DesignError("a fast eigenvalue is zero: the deflections have no stiffness here")
     K = case.law.fast.gain(q)
     closed = None if K is None else np.abs(np.linalg.eigvals(A2 + B2 @ K)).min()
-    # Every mode that does not decay on its own, and those that decay slower than asked for.
+    # This tests every mode that does not decay by itself, or decays slower than required.
     alpha = float(case.law.fast.parameters.get("alpha", 0.0))
     ok, worst = is_stabilisable(A2, B2, alpha)
     return {
@@ -68,7 +68,7 @@ def at(case, q, qd, slow):
 
 
 def configurations(model, count, seed):
-    """Configurations within the joints' limits: even for one joint, else random, shape (count, n) [rad]."""
+    """Configurations within the joints' limits: evenly spaced for one joint, else random, shape (count, n) [rad]."""
     ranges = []
     for joint in model.arm.joints:
         low, high = joint.limits.position
@@ -82,7 +82,7 @@ def configurations(model, count, seed):
 def study(case, count=200, seed=0):
     """Time scales along the motion and in `count` configurations of the workspace.
 
-    Ready for JSON; without a slow loop or modes only ``reason``.
+    Ready for JSON; only ``reason`` if there is no slow loop, or no modes.
     """
     slow = slow_poles(case)
     if slow is None or not case.model.n_modes:
@@ -120,7 +120,7 @@ def _worst(rows, positions):
 
 
 def spectra(case, slow):
-    """Poles of the slow and the fast subsystem, open and closed, and of the whole, at the motion's end."""
+    """Poles of the slow and the fast subsystem, open and closed, and of the whole loop, at the motion's end."""
     model, q = case.model, case.q
     terms, K = model.terms(q, np.zeros(model.n_joints)), case.law.fast.gain(q)
     opened = time_scales(terms).fast
@@ -139,7 +139,7 @@ def spectra(case, slow):
 
 
 def gain_sweep(case, factors=GAINS):
-    """How a faster slow loop affects the bending: full-order poles over slow.kp, with kv for critical damping.
+    """Effect of a faster slow loop on the bending: full-order poles over slow.kp, with kv for critical damping.
 
     `factors` multiply slow.kp [-]. Returns ``reason``, or ``rows``: per factor the fast modes' frequency [rad/s] and
     damping ratio (those of the 2m fastest poles), the slowest pole's real part and the poles; a row whose design fails

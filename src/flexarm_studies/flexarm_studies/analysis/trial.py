@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs that show whether the nonlinear loop is stable, with its sensors, observer and limits."""
+"""Makes runs that show whether the nonlinear loop is stable, with its sensors, observer and limits."""
 
 from dataclasses import replace
 
@@ -13,14 +13,14 @@ from ..loop import scenario as scenarios
 SIZE, RISE = 0.02, 0.15
 #: Shortest and longest time over which it is watched [s].
 WATCHED, MAX_WATCHED = 3.0, 10.0
-#: A motion dies out if it is in the last third of the time at most this fraction of the third before [-].
+#: A motion dies out if its size in the last third of the time is at most this fraction of that in the third before [-].
 DECAYED = 0.95
 #: Anything smaller than this is at rest [rad], [m], [N m].
 REST = 1e-7
 
 
 def long_enough(pole):
-    """How long to watch a loop with this critical pole [s]: each third of the time holds a whole oscillation."""
+    """Time for which to watch a loop with this critical pole [s]: each third of it contains a whole oscillation."""
     period = 2.0 * np.pi / abs(pole.imag) if pole.imag else 0.0
     return float(min(max(WATCHED, 3.0 * period), MAX_WATCHED))
 
@@ -35,7 +35,7 @@ def small_motion(q):
 
 
 def dies_out(scenario, q, gain=1.0, watched=WATCHED):
-    """Whether the vibration that a small motion to q leaves dies out, while it is `watched` [s].
+    """Whether the vibration that remains after a small motion to q dies out, while it is `watched` [s].
 
     The `scenario` has its trajectory replaced; `gain` is a factor on the torque between controller and arm [-]. False
     if joints and deflections, or the torque, move in the last third of the time as much as in the third before; if the

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A driver that lies, and what its lies do to an arm: ``flexarm attack``."""
+"""``flexarm attack``: lets a driver send wrong data on purpose ("lies"), and measures what the lies do to an arm."""

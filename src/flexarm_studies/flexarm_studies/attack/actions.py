@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is done to driver and controller at the moment of a lie.
+"""Defines what is done to driver and controller at the moment of a lie.
 
 Each function takes a `LyingDriver` and returns what to do: pairs of a time from that moment [s] and a call.
 """
@@ -11,7 +11,7 @@ from flexarm_dynamics.arm.strain_map import gauge_rows
 
 from ..loop import scenario as scenarios
 
-#: A spoofed torque is this fraction of the limit [-], and acts for so long [s].
+#: Spoofed torque as a fraction of the limit [-], and its duration [s].
 SPOOFED, SPOOFED_FOR = -1.0, 0.02
 #: A limit is set to this fraction of the value that it watches [-].
 BELOW = 0.9
@@ -33,7 +33,7 @@ def refuse_a_second(driver):
 
 
 def spoof(driver):
-    """A stranger sends torques under the controller's name for a while."""
+    """Another sender sends torques under the controller's name for a while."""
     torque = SPOOFED * driver.loop.model.arm.torque_limits
     return [
         (0.0, lambda: setattr(driver, "spoofed", torque)),
@@ -42,7 +42,7 @@ def spoof(driver):
 
 
 def fail(driver):
-    """A fault: the scale for every lie that ends in one, for the safe action alone stops the arm then."""
+    """A fault. It is the scale for every lie that ends in a fault: then the safe action alone stops the arm."""
     return [(0.0, lambda: driver.loop.controller.fail("attack: a fault of its own"))]
 
 
@@ -56,12 +56,12 @@ def recover_moving(driver):
 
 
 def restart_soon(driver):
-    """The controller is killed; the new one answers after 20 ms, the old one's torque still acting."""
+    """The controller is killed; the new one answers after 20 ms, while the old one's torque still acts."""
     return _restart(driver, 0.02)
 
 
 def restart_later(driver):
-    """The controller is killed; the new one answers after 200 ms, the safe action acting."""
+    """The controller is killed; the new one answers after 200 ms, while the safe action acts."""
     return _restart(driver, 0.2)
 
 
@@ -117,7 +117,7 @@ def limit_deflection(driver):
 
 
 def _limit(driver, name, present):
-    """A limit that has just been exceeded; as soon as the stop has begun the old one is back."""
+    """Set a limit that has just been exceeded; when the stop has begun, the old limit is restored."""
     controller = driver.loop.controller
     old = dict(controller.supervisor.settings)
 
@@ -130,7 +130,7 @@ def _limit(driver, name, present):
 
 
 def asked_to_stop(driver):
-    """The observer says once that the arm is to be brought to rest."""
+    """The observer requests once that the arm is brought to rest."""
 
     def ask():
         driver.trust, driver.reason = ArmSample.STOP, "attack: the device asks for a stop"

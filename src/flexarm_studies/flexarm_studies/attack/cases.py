@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is attacked: arms with their motion and controller, observers, with and without measured joint velocity."""
+"""Defines what is attacked: arms with motion and controller, observers, with and without measured joint velocity."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,17 +19,17 @@ ARMS = {
     "two_link": "quintic:to=1.0472,duration=2",
     "long_reach": "quintic:from=0;1.2;0.8;-0.8,to=0.4;0.9;1.2;-0.4,duration=2",
 }
-#: The observer that a design is made with.
+#: The observer for which a design is made.
 DESIGNED = TYPES["observer.type"]
 #: Arm to its control under `DESIGNED` and under other observers: shipped file (empty: the nodes' defaults), rate [Hz].
-#: The nodes' control without options is the paper's for R; for other arms it is a design, whose gains count on its own
-#: observer. Those of the other file are for observers that have a model.
+#: Without options, the nodes' control for R is that of the paper. For other arms it is a design, whose gains are made
+#: for its own observer. The gains of the other file are for observers that have a model.
 CONTROLS = {
     "R": (("", 1000.0), ("", 1000.0)),
     "two_link": (("two_link_designed", 500.0), ("two_link", 1000.0)),
     "long_reach": (("long_reach_designed", 500.0), ("long_reach", 500.0)),
 }
-#: Bits of the gauges' converters where an arm file states none.
+#: Bits of the gauges' converters if an arm file states none.
 BITS = 16
 #: Observers with the noise levels of `kalman`.
 FILTERS = ("kalman", "extended_kalman")
@@ -49,7 +49,7 @@ class Case:
     velocity : bool
         Whether joint velocities are measured.
     noise : bool
-        Whether encoders and gauges count, and gauges have noise.
+        Whether encoders and gauges round to counts, and gauges have noise.
     amplitude : bool
         Whether the driver sends modal amplitudes beside the strains.
     rates : bool
@@ -67,7 +67,7 @@ class Case:
         return f"{self.arm}, {self.observer}, {'with' if self.velocity else 'without'} velocity"
 
     def scenario(self):
-        """The honest `Scenario`."""
+        """The `Scenario` without lies."""
         file, rate = CONTROLS[self.arm][self.observer != DESIGNED]
         values = scenarios.parameters(file) if file else {}
         own = values.get("observer.type")
@@ -90,7 +90,7 @@ class Case:
 
 @cache
 def arm_of(name, noise):
-    """The shipped arm; with `noise`, that of the comparison's sensors where its file states none."""
+    """The shipped arm; with `noise`, it has that of the comparison's sensors where its file states none."""
     arm = arm_file.load(name)
     if not noise:
         return arm
@@ -107,12 +107,12 @@ def observers():
 
 
 def chosen(arms=None, names=None):
-    """The cases of some `arms`, and observers by their `names`, None for all; each with and without velocity.
+    """The cases of some `arms` and of the observers `names`, None for all; each with and without velocity.
 
     Raises
     ------
     FlexarmError
-        For an arm or observer that there is not.
+        For an unknown arm or observer.
     """
     for option, given, known in (("--arms", arms, ARMS), ("--observers", names, observers())):
         unknown = [name for name in given or () if name not in known]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm attack``: a driver that lies, on every arm, under every observer."""
+"""``flexarm attack``: runs a driver that lies, on every arm, under every observer."""
 
 import json
 import os
@@ -63,7 +63,7 @@ def add_arguments(parser):
 
 
 def attack(options):
-    """Run the sub-command; the exit code."""
+    """Run the sub-command; return the exit code."""
     at_least("--random", options.random, 0)
     at_least("--workers", options.workers, 1)
     at_least("--healthy", options.healthy, 1)
@@ -83,7 +83,7 @@ def attack(options):
 
         return healthy(options, cases)
     todo = cover(cases, wanted) if options.cover else jobs(cases, wanted)
-    # After every few runs, so that an interrupted study loses nothing.
+    # After every few runs, so an interrupted study loses nothing.
     rows = study(todo, options.workers, lambda rows: _store(options, rows))
     return _report(options, rows)
 
@@ -99,7 +99,7 @@ def _stored(file):
 
 
 def _store(options, rows):
-    """Write the files that are asked for, of all runs or of those that there are."""
+    """Write the requested files, for all runs or for those done so far."""
     if options.json:
         Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     if options.note:
@@ -107,7 +107,7 @@ def _store(options, rows):
 
 
 def _report(options, rows):
-    """Write and print what the runs show; the exit code."""
+    """Write and print what the runs show; return the exit code."""
     entries = report.summary(rows)
     _store(options, rows)
     if options.write:
@@ -121,7 +121,7 @@ def _split(text):
 
 
 def _lies(options):
-    """The lies that are asked for, by name."""
+    """The requested lies, by name."""
     known = LIES | random_lies(options.random, options.seed)
     words = _split(options.lies)
     wanted = {k: v for k, v in known.items() if words is None or any(w in k for w in words)}
@@ -132,7 +132,7 @@ def _lies(options):
 
 
 def jobs(cases, wanted):
-    """(case, lie, moment, pick) of every run; runs of the same case stand together."""
+    """(case, lie, moment, pick) of every run; runs of the same case are adjacent."""
     found = {}
     for case in cases:
         for lie in wanted.values():
@@ -144,9 +144,9 @@ def jobs(cases, wanted):
 
 
 def cover(cases, wanted):
-    """Some of the `jobs`: each lie once under each observer, with arms, measured velocity and moments in turn.
+    """A part of the `jobs`: each lie once under each observer, with arms, measured velocity and moments in turn.
 
-    With as many observers as arms or more among ``cases``, each lie of ``wanted`` comes on each arm as well.
+    If ``cases`` has at least as many observers as arms, each lie of ``wanted`` also occurs on each arm.
     """
     arms = tuple(dict.fromkeys(case.arm for case in cases))
     names = tuple(dict.fromkeys(case.observer for case in cases))
@@ -154,7 +154,7 @@ def cover(cases, wanted):
     for i, lie in enumerate(wanted.values()):
         own = jobs(cases, {lie.name: lie})
         for j, name in enumerate(names):
-            # What suits best: this observer, this arm, with or without velocity, this moment.
+            # What the job should have: this observer, this arm, with or without velocity, this moment.
             turn = (
                 arms[(i + j) % len(arms)],
                 bool((i // 3 + j) % 2),
@@ -169,7 +169,7 @@ def cover(cases, wanted):
 
 
 def _alike(job, wish):
-    """What of a wish for observer, arm, velocity and moment a job fulfils, in this order."""
+    """Which parts of a wish a job fulfils: observer, arm, velocity and moment, in this order."""
     case, _, moment = job
     return tuple(
         a == b for a, b in zip((case.observer, case.arm, case.velocity, moment), wish, strict=True)
@@ -183,10 +183,10 @@ def _case_of(lie, case):
 
 
 def study(todo, workers=None, store=lambda rows: None):
-    """Run jobs in processes, `workers` or one per core; the rows, in the order of `todo`, which is that of `jobs`.
+    """Run jobs in processes, `workers` or one per core; return the rows in the order of `todo`, that of `jobs`.
 
-    A case whose honest motion fails is reported, and has no rows: there is nothing to compare with.
-    Those that there are go to `store` each time some are added.
+    A case whose motion fails without a lie is reported, and has no rows: there is nothing to compare with. The rows so
+    far are passed to `store` each time some are added.
     """
     progress = Progress()
     parts = _parts(todo)
@@ -204,7 +204,7 @@ def study(todo, workers=None, store=lambda rows: None):
     return [row for job in todo if (row := rows[job])]
 
 
-#: Runs that go to a process at once: each process runs the honest motion of a case but once.
+#: Number of runs that go to a process at once: each process runs a case's motion without a lie only once.
 AT_ONCE = 6
 
 
@@ -226,7 +226,7 @@ def _honest(case):
 
 
 def run_all(part):
-    """Rows of the runs of one case, in a process of its own; None each where the honest motion fails."""
+    """Rows of the runs of one case, in a process of its own; each is None if the motion without a lie fails."""
     from .run import attack as run
 
     case = part[0][0]

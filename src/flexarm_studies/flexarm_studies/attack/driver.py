@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The driver that lies: between an honest arm and its control, sample by sample, without ROS.
+"""Simulates the driver that lies, between an arm without faults and its control, sample by sample, without ROS.
 
-The arm is a `Simulator` with its safe actions. What it measures goes through a `FaultInjector`, which tells the lies;
-observer and controller answer each message as their nodes do; the torques go through the rules of
-`flexarm_ros.torque_gate` (`Gate`), counted from the first time that a sample was sent.
+The arm is a `Simulator` with its safe actions. Its measurements go through a `FaultInjector`, which makes the lies.
+Observer and controller answer each message as their nodes do. The torques go through the rules of
+`flexarm_ros.torque_gate` (`Gate`); their age counts from the first time that a sample was sent.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from flexarm_sim.fault_injector import FIELDS, FaultInjector, Sample
 
 from ..loop import scenario as scenarios
 
-#: As the drivers' `torque_timeout` and the controller's `state_timeout` [s].
+#: Like the drivers' `torque_timeout` and the controller's `state_timeout` [s].
 TORQUE_TIMEOUT, STATE_TIMEOUT = 0.05, 0.5
 #: After a race for one sample's answer, silence for this long [s].
 ALONE = 1.0
@@ -32,16 +32,16 @@ _ARRAYS = {
 
 
 class Gate:
-    """Which torque acts: the rules of `flexarm_ros.torque_gate.TorqueGate`, which has messages of ROS.
+    """Decides which torque acts, by the rules of `flexarm_ros.torque_gate.TorqueGate`, which needs messages of ROS.
 
-    A sample names the controller whose answer to the one before was taken; only that controller's answer to it acts,
+    A sample names the controller whose answer to the sample before was taken. Only that controller's answer to it acts,
     and no longer than `TORQUE_TIMEOUT` after the sample was first sent. Two torques that answer one sample under one
-    name are a race: the safe action acts for `ALONE`.
+    name are a race: then the safe action acts for `ALONE`.
 
     Parameters
     ----------
     session : int
-        Of the states that are sent.
+        Session of the states that are sent.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Gate:
         self.begin(session)
 
     def begin(self, session):
-        """A new session: earlier torques answer nothing any more."""
+        """Begin a new session: earlier torques no longer answer any sample."""
         self.session, self._sent, self._newest, self._answered = session, {}, -1, -1
         self._claimant, self._fresh_until = 0, -np.inf
         self._torque, self._answer, self._until, self._raced_until = None, None, -np.inf, -np.inf
@@ -64,7 +64,7 @@ class Gate:
         return self._claimant if time <= self._fresh_until + ROUNDING else 0
 
     def sent(self, sequence, time):
-        """Note that a sample is sent at `time` [s]; that it is sent again changes nothing in a right gate."""
+        """Note that a sample is sent at `time` [s]; in a correct gate, sending it again changes nothing."""
         if self.renews or sequence > self._newest:
             self._sent[sequence] = time, self.names(time)
             self._newest = sequence
@@ -72,11 +72,11 @@ class Gate:
             del self._sent[next(iter(self._sent))]
 
     def _oldest(self):
-        """When the oldest sample that is kept was sent [s]."""
+        """Time at which the oldest kept sample was sent [s]."""
         return next(iter(self._sent.values()))[0]
 
     def offer(self, session, sequence, controller, torque, time):
-        """A controller's torque (n,) [N m], None for DISABLED, that answers a sample, at a `time` [s]."""
+        """Take a controller's answer to a sample at a `time` [s]: a torque (n,) [N m], None for DISABLED."""
         if session != self.session or sequence not in self._sent or sequence < self._answered:
             return
         if time < self._raced_until:
@@ -93,7 +93,7 @@ class Gate:
         self._torque = torque if named == controller else None
 
     def torque(self, time):
-        """What acts at a `time` [s]; None: the safe action."""
+        """The torque that acts at a `time` [s]; None: the safe action."""
         return self._torque if time <= self._until + ROUNDING else None
 
 
@@ -112,21 +112,21 @@ class LyingDriver:
     Attributes
     ----------
     refuses : bool
-        The drives do not take the torque: the safe action acts, and the report says so.
+        The drives do not take the torque: the safe action acts, and the message reports this.
     spoofed : ndarray or None
-        A stranger's torque (n,), which is sent under the controller's name, session and sequence [N m].
+        Torque (n,) of another sender, which is sent under the controller's name, session and sequence [N m].
     controller_id : int
-        Of the controller that is running.
+        Id of the controller that is running.
     answers : bool
         Whether there is a controller that answers.
     trust, reason : int, str
-        What the device itself says of its samples, as in `ArmState`.
+        What the device itself reports about its samples, as in `ArmState`.
     last_new : float
-        When the last sample that was new was answered [s].
+        Time at which the last new sample was answered [s].
     off : dict of str to list of (float, float)
-        Of each field that a fault falsifies: when, and by how much at most.
+        For each field that a fault falsifies: time, and largest error.
     doubt : str
-        Of the last estimate: which sensor the observer doubts.
+        The sensor that the observer doubts in the last estimate.
     """
 
     def __init__(self, scenario, faults=(), begin=0.0):
@@ -152,7 +152,7 @@ class LyingDriver:
         return self.loop.simulator.time
 
     def answer(self):
-        """Measure, lie, and let observer and controller answer; the torque that acts next, or None."""
+        """Measure, lie, and let observer and controller answer; return the torque that acts next, or None."""
         true, time = self.loop.measure(), self.time
         true.controller_id = 0 if self.refuses else self.gate.names(time)
         true.trust, true.doubt = self.trust, self.reason
@@ -164,7 +164,7 @@ class LyingDriver:
         return None if self.refuses else self.gate.torque(time)
 
     def advance(self, torque):
-        """One period of the arm under the torque that acts."""
+        """Advance the arm by one period under the torque that acts."""
         self.loop.simulator.advance(torque)
 
     @property
@@ -172,7 +172,7 @@ class LyingDriver:
         return 1 + self.injector.session
 
     def _messages(self, true, time):
-        """What is sent for a sample, in order."""
+        """The messages that are sent for a sample, in order."""
         if not self.injector.faults or time < self._begin - 1e-9:
             return [_sample(true, _fields(true, self._names))]
         out = self.injector.outgoing(_fields(true, self._names), time)
@@ -190,11 +190,11 @@ class LyingDriver:
                 self.off.setdefault(signal, []).append((time, size))
 
     def _answered(self, message, time):
-        """Observer and controller on one message, as their nodes."""
+        """Let observer and controller handle one message, as their nodes do."""
         loop, controller = self.loop, self.loop.controller
         if not self.answers:
             return
-        if message.key != self._last_key:  # a repeat is no sign of life
+        if message.key != self._last_key:  # a repetition is not a sign of life
             self.last_new, self._last_key = time, message.key
         try:
             estimate = loop.estimate(message)
@@ -207,13 +207,13 @@ class LyingDriver:
             self._send(message.key, controller.torque.copy() if enabled else None)
 
     def _send(self, key, torque):
-        """The controller's answer to a sample; a stranger's comes right after it."""
+        """Send the controller's answer to a sample; a spoofed one comes right after it."""
         self.gate.offer(*key, self.controller_id, torque, self.time)
         if self.spoofed is not None:
             self.gate.offer(*key, self.controller_id, self.spoofed, self.time)
 
     def _watch(self, time):
-        """The controller's node notices that the states have stopped."""
+        """Do as the controller's node, which notices that the states have stopped."""
         if time - self.last_new > STATE_TIMEOUT and self.loop.controller.enabled:
             self.loop.controller.distrust(f"no arm_state_estimate for {STATE_TIMEOUT:g} s")
             self._send(self._last_key, None)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""False alarms: samples in which nothing is wrong but what is usual, and how often something was reported.
+"""Counts false alarms: reports about samples with only the usual disturbances.
 
-In each run the arm moves, rests, moves back part of the way and holds, each time as far and as fast as it happens, with
-the noise and the counts of encoders and gauges, with 20 % of its samples lost and stamps off by up to 40 % of the
-period; its payload is off by up to 30 %, and its joints have friction that the controller does not know.
+In each run the arm moves, rests, moves back part of the way and holds, with random distances and speeds. Encoders and
+gauges have their noise and counts, 20 % of the samples are lost, and stamps are off by up to 40 % of the period. The
+payload is off by up to 30 %, and the joints have friction that the controller does not know.
 """
 
 import json
@@ -27,21 +27,21 @@ from .cases import DESIGNED, MOTION, START, arm_of
 from .driver import LyingDriver
 from .run import drive, driver_of
 
-#: What is usual: lost samples [-], error of a stamp over the period [-], of the payload [-], friction over the
-#: torque limit: Coulomb's [-], and viscous at 1 rad/s [-].
+#: The usual disturbances: lost samples [-], error of a stamp over the period [-], error of the payload [-], friction
+#: over the torque limit: Coulomb [-], and viscous at 1 rad/s [-].
 LOSS, JITTER, PAYLOAD, COULOMB, VISCOUS = 0.2, 0.4, 0.3, 0.005, 0.005
-#: A motion is this part of the case's own way, and takes this multiple of its time [-]; so long it rests [s].
+#: Ranges of a motion's distance and duration, relative to those of the case's motion [-]; duration of a rest [s].
 WAY, PACE, RESTS = (0.3, 1.0), (0.9, 1.5), 0.4
-#: After its last motion an arm holds for so long [s].
+#: Duration for which an arm holds after its last motion [s].
 HOLDS = 1.0
-#: So many runs of a case after each other are of one motion, whose plan takes longer than the run where links are many.
+#: Number of successive runs of a case with the same motion: with many links, its plan takes longer than the run.
 ALIKE = 5
-#: Of each round of runs so many are an arm's; one where none is given. A sample of these costs less.
+#: Number of an arm's runs in each round, by default one. A sample of these arms costs less.
 OFTEN = {"R": 6, "two_link": 2}
 
 
 def plant(case, random):
-    """The simulated arm: that of the case, with another payload's factor, and friction; and that factor."""
+    """The simulated arm, that of the case with additional friction; and a factor of its payload."""
     arm = arm_of(case.arm, case.noise)
     joints = []
     for joint in arm.joints:
@@ -53,9 +53,9 @@ def plant(case, random):
 
 
 def bears(case):
-    """Whether a case's control bears all of that: its real errors would count as false alarms.
+    """Whether a case's control withstands all of that; otherwise its real errors would count as false alarms.
 
-    Under gravity only what was designed for unknown payloads does; on two_link a joint swings by itself under
+    Under gravity only a control designed for unknown payloads does. On two_link a joint swings by itself under
     `motion_kalman` without measured velocity.
     """
     if case.arm == "long_reach":
@@ -64,7 +64,7 @@ def bears(case):
 
 
 def motion(case, random):
-    """There and back part of the way, as a scenario's trajectory; and when it is over [s]."""
+    """A motion there and part of the way back, as a scenario's trajectory; and the time of its end [s]."""
     own = case.scenario()
     loop = scenarios.loop_of(own)
     way = scenarios.trajectory_of(own.trajectory, loop.model, loop.simulator.position)
@@ -84,9 +84,10 @@ def motion(case, random):
 
 
 class UsualDriver(LyingDriver):
-    """A driver whose samples are lost, and stamped at other times, as is usual.
+    """A driver that loses samples and stamps them at other times, to the usual extent.
 
-    So do `state drop` and `state jitter` of the fault injector; numbers from one generator take a tenth of the time.
+    `state drop` and `state jitter` of the fault injector do the same; numbers from one generator take a tenth of the
+    time.
     """
 
     def __init__(self, *args, **others):
@@ -103,16 +104,16 @@ class UsualDriver(LyingDriver):
 
 
 class Plans:
-    """What controllers have prepared for the last motion of some cases, for those that begin it in the same place."""
+    """Keeps what controllers have prepared for the last motions, for loops that begin them in the same place."""
 
-    #: So many are kept.
+    #: Number of preparations that are kept.
     KEPT = 4
 
     def __init__(self):
         self._kept = {}
 
     def prepared(self, case, number, loop, trajectory):
-        """What the controller of a case's `loop` prepares for its motion of this `number`; None where it can't."""
+        """What the controller of a case's `loop` prepares for its motion of this `number`; None if it can't."""
         key = str(case), number, loop.controller.reference.resting.tobytes()
         if key not in self._kept:
             while len(self._kept) >= self.KEPT:
@@ -125,7 +126,7 @@ PLANS = Plans()
 
 
 def healthy_run(case, seed):
-    """One run: number of samples, and what was reported; empty: nothing. Of `ALIKE` seeds the motion is the same."""
+    """One run: number of samples, and what was reported; empty: nothing. `ALIKE` seeds share the same motion."""
     number, random = seed // ALIKE, np.random.default_rng([seed, 7])
     arm, payload = plant(case, random)
     way, lasts = motion(case, np.random.default_rng([number, 8]))
@@ -138,7 +139,7 @@ def healthy_run(case, seed):
     try:
         trace = drive(driver, until=START + lasts + HOLDS, prepare=prepare)
     except FlexarmError as error:
-        # The motion is refused: a finding about this arm, not the end of the study.
+        # The motion is refused: this is a finding about the arm, not the end of the study.
         return round(START / driver.period), str(error)
     alarms = [text for time, text in trace.texts if text and time > START]
     if trace.lost or trace.state != State.HOLDING:
@@ -147,9 +148,9 @@ def healthy_run(case, seed):
 
 
 def planned(cases, seed):
-    """Yield (case, seed) without end: rounds in which each arm comes as often as `OFTEN` states, its cases in turn.
+    """Yield (case, seed) without end, in rounds: each arm comes as often as `OFTEN` states, with its cases in turn.
 
-    Each case comes `ALIKE` times at once. Cases that can't bear what is usual are left out.
+    Each case comes `ALIKE` times in succession. Cases that can't withstand the usual disturbances are left out.
     """
     arms = {}
     for case in filter(bears, cases):
@@ -168,7 +169,7 @@ def _row(case, seed, samples, alarm):
 
 
 def stored(file):
-    """Rows of the runs that an earlier study wrote to a file, one a line; none where there is no file.
+    """Rows of the runs that an earlier study wrote to a file, one per line; none if there is no file.
 
     Raises
     ------
@@ -192,7 +193,7 @@ def stored(file):
 
 
 def _results(calls, workers, samples):
-    """Yield a row per run, in processes, until so many `samples` are done."""
+    """Yield a row per run, in processes, until this number of `samples` is done."""
     if workers == 1:
         while samples > 0:
             case, seed = next(calls)
@@ -213,7 +214,7 @@ def _results(calls, workers, samples):
 
 
 def summary(rows):
-    """Lines on the runs: how many samples of what, and each alarm."""
+    """Lines about the runs: number of samples of each case, and each alarm."""
     total, alarms = sum(row["samples"] for row in rows), [row for row in rows if row["alarm"]]
     lines = [f"{total} healthy samples in {len(rows)} runs, {len(alarms)} of them with an alarm"]
     for case in dict.fromkeys(row["case"] for row in rows):
@@ -223,7 +224,7 @@ def summary(rows):
 
 
 def healthy(options, cases):
-    """Run `--healthy`; the exit code. With `--json` it goes on where the file ends: an interrupted run counts."""
+    """Run `--healthy`; return the exit code. With `--json` it goes on where the file ends: interrupted runs count."""
     rows = stored(options.json) if options.json else []
     known = {(row["case"], row["seed"]) for row in rows}
     calls = (call for call in planned(cases, options.seed) if (str(call[0]), call[1]) not in known)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lies: what the driver does wrong, when, and what has to come of it.
+"""Defines the lies: what the driver does wrong, when, and what must follow from it.
 
-A lie is made of lines of `flexarm_sim.fault_injector`, so that the simulator's node can tell it as well
-(docs/fault_injection.md), or of an action on driver and controller, see `actions`. In a line ``{at}`` is the moment
-of the lie, ``{one}`` the time of one sample, ``{jitter}`` 40 % of it; ``{joint}``, ``{gauge}`` and ``{mode}`` are an
-entry of the arm.
+A lie consists of lines of `flexarm_sim.fault_injector`, which the simulator's node can use as well
+(docs/fault_injection.md), or of an action on driver and controller, see `actions`. In a line ``{at}`` is the moment of
+the lie, ``{one}`` the time of one sample, ``{jitter}`` 40 % of it; ``{joint}``, ``{gauge}`` and ``{mode}`` are an entry
+of the arm.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ import numpy as np
 
 #: Moments, as fractions of the motion: at its fastest, and while its end is held.
 MOVING, HOLDING = (0.5,), (1.15,)
-#: `~/stop` and the limits come at these.
+#: Moments of `~/stop` and of exceeded limits.
 MANY = (0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
-#: Those at which the links are bent: in the middle they are not, and the limit would be one of noise.
+#: Moments at which the links are bent: in the middle they are not, and the limit would be at the level of noise.
 BENT = (0.25, 0.75, 0.95)
 
-#: Kinds of lies, by what has to come of them.
+#: Kinds of lies, by what must follow from them.
 LASTING, SINGLE, INTERRUPTION, STOP, HEALTHY = (
     "lasting",
     "single",
@@ -36,25 +36,26 @@ class Lie:
     ----------
     name : str
     kind : str
-        LASTING: it does not end, and is to be named; SINGLE: one sample, which must hardly be felt; INTERRUPTION:
-        torque goes and comes back; STOP: the controller is to bring the arm to rest; HEALTHY: no lie, no alarm.
+        LASTING: it does not end, and must be named; SINGLE: one sample, which must have hardly any effect;
+        INTERRUPTION: torque ends and returns; STOP: the controller must bring the arm to rest; HEALTHY: no lie, no
+        alarm.
     faults : tuple of str
     action : str
         Name of a function of `actions`.
     says : str
-        Regular expression of what names the lie, in lower case; empty where nothing has to be named.
+        Regular expression of the text that names the lie, in lower case; empty if nothing has to be named.
     ends : str
-        State of the supervisor at the end, where one is demanded.
+        Required state of the supervisor at the end, if any.
     moments : tuple of float
     velocity : bool
         It needs measured joint velocities.
     gauges : int
-        It needs so many gauges.
+        Number of gauges that it needs.
     amplitude, rates : bool
         It needs a driver that sends modal amplitudes, modal rates.
     visible : float
-        From when the lie can be seen at all: the false reading differs by so much from the true one, in the
-        reading's unit; 0: from its first sample.
+        Error of the false reading from which the lie can be seen at all, in the reading's unit; 0: from its first
+        sample.
     """
 
     name: str
@@ -71,7 +72,7 @@ class Lie:
     visible: float = 0.0
 
     def lines(self, arm, at, period, pick=0):
-        """Its lines for an `arm`, at a time `at` [s]; `pick` chooses the entry."""
+        """The lines of the lie for an `arm`, at a time `at` [s]; `pick` chooses the entry."""
         entries = {"joint": arm.joint_names, "gauge": arm.gauge_names, "mode": arm.observed_modes}
         words = {k: v[pick % len(v)] for k, v in entries.items() if v}
         return tuple(
@@ -85,7 +86,7 @@ class Lie:
 
 
 def _readings():
-    """Lies about one reading that last, and those of one sample."""
+    """Lasting lies about one reading, and lies of one sample."""
     position, velocity = r"position|encoder", r"velocity"
     strain = r"strain|gauge"
     far, fast, bent = 0.01, 0.1, 2e-5
@@ -285,7 +286,7 @@ def _messages():
 
 
 def _actions():
-    """What users, strangers and drives do."""
+    """Actions of users, other senders and drives."""
     refused = r"refus|report|not appl|applied|safe action|driver"
     return (
         Lie("torque refused for good", LASTING, action="refuse", says=refused, ends="FAULT"),
@@ -322,7 +323,7 @@ LIES = {lie.name: lie for lie in (*_readings(), *_messages(), *_actions())}
 def random_lies(count, seed):
     """`count` lies drawn at random, each with a moment of its own: outliers, biases, scales, windows of any length.
 
-    They are judged by what the arm does alone: which sensor is to be named is not known where several lie.
+    They are judged only by what the arm does: if several sensors lie, it is unknown which one must be named.
     """
     random = np.random.default_rng(seed)
     signals = {

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast bent links turn a joint that was held, once it is let go: a speed that no control prevents.
+"""Computes how fast bent links turn a joint that was held and is let go: a speed that no control prevents.
 
-While a brake holds the joints, the links may be as bent as the motion bends them. Torque that returns may be a tenth of
-its limit in the first 20 ms, beside what holds the arm against gravity (*returning* of `run`): too little to hold a
-light joint against its links.
+While a brake holds the joints, the links may be bent as much as in the motion. In the first 20 ms, returning torque may
+be a tenth of its limit, in addition to the torque that holds the arm against gravity (*returning* of `run`). This is
+too little to hold a light joint against its links.
 """
 
 from dataclasses import replace
@@ -24,10 +24,10 @@ COLUMNS = (
 
 
 def recoil(honest, allowed=CRITERIA["returning"]):
-    """Largest speed of each joint within `SOON` after it is let go, over its largest in the motion.
+    """Largest speed of each joint within `SOON` after it is let go, over its largest speed in the motion.
 
-    The arm stands, bent as the motion bends it at its largest strain. Then the static torque acts, and against
-    each joint's first acceleration a part of its limit.
+    The arm is at rest, bent as in the motion at its largest strain. Then the static torque acts, and a part of the
+    torque limit against each joint's first acceleration.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def table(cases):
 
 
 def report(cases, file=None):
-    """Print the table, and write it into a document; the exit code."""
+    """Print the table, and write it into a document; return the exit code."""
     lines = table(cases)
     print("\n".join(lines))
     if file:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of ``flexarm attack``: per lie the worst over arms, observers and moments."""
+"""Makes the table of ``flexarm attack``: for each lie the worst case over arms, observers and moments."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from .lies import LASTING
 from .run import CRITERIA
 
 MARKERS = "<!-- attack table: begin -->", "<!-- attack table: end -->"
-#: In place of a time: it did not happen before the run's end.
+#: Stands in place of a time: it did not happen before the run's end.
 NEVER = "never"
 COLUMNS = (
     "lie", "speed", "strain", "excursion [rad]", "step", "outlier [%]", "returning [%]", "safe after [s]",
@@ -17,7 +17,7 @@ COLUMNS = (
 
 
 def summary(rows):
-    """A dict per lie: the worst of its `rows`, runs, how many held, and what failed how often."""
+    """A dict per lie: the worst of its `rows`, number of runs, how many passed, and how often each criterion failed."""
     found = []
     for name in dict.fromkeys(row["lie"] for row in rows):
         own = [row for row in rows if row["lie"] == name]
@@ -41,7 +41,7 @@ def _worst(rows, key):
 
 
 def badness(entry):
-    """By how much a summary's worst measure exceeds its criterion; those that hold come last."""
+    """By how much a summary's worst measure exceeds its criterion; lies that pass come last."""
     if not entry["failed"]:
         return 0.0
     ratios = [
@@ -64,7 +64,7 @@ def table(entries):
 
 
 def worst_runs(rows, count=15):
-    """Lines on the runs that fail worst."""
+    """Lines about the runs with the worst failures."""
     bad = sorted((r for r in rows if r["failed"]), key=_ratio, reverse=True)
     return [
         f"{r['arm']}, {r['observer']}, {'with' if r['velocity'] else 'without'} velocity: {r['lie']} at"
@@ -84,7 +84,7 @@ def write(file, entries):
 
 
 def note(file, rows):
-    """Write the table with the worst lies on top, and the worst runs, to a file of its own."""
+    """Write the table, with the worst lies on top, and the worst runs to a separate file."""
     entries = sorted(summary(rows), key=badness, reverse=True)
     text = "\n".join([*table(entries), "", *worst_runs(rows), ""])
     Path(file).write_text(text, encoding="utf-8")

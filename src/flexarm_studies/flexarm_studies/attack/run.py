@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Runs of a lie, and what they measure.
+r"""Runs a lie, and measures its effects.
 
-A run is compared with the honest one of the same case, `Honest`, whose motion sets the scale:
+A run is compared with the run of the same case without a lie, `Honest`, whose motion sets the scale:
 
-- *speed*: the largest speed of a joint over its largest in the motion, :math:`\max|\dot q_i|/\max|\dot q_i^h|`;
-- *strain*: the largest strain on a gauge over the largest in the motion; both also *under torque*: before the safe
-  action;
-- *excursion*: how far a joint leaves the range that it passes through in the motion [rad];
-- *step*: the largest change of torque between two samples over that in the motion, begin and end included: a motion
-  whose jerk jumps changes its torque most there, and so does a run that is stopped after it. A motion that kicks by
-  more than `KICK` of the torque limit is no scale beyond that;
-- *outlier*: how far the torque is from that of the honest run, as a fraction of its limit; if that is too much, less
-  what other noise of the sensors alone changes in it;
-- *returning*: the largest torque in the first `SOON` after an interruption, less what holds the arm against gravity,
-  as a fraction of its limit;
-- *silent*: for how long a torque acts without a new sample [s];
-- *safe*: from the lie until the safe action acts or the arm rests [s];
-- *named*: from when the lie can be seen until the controller's reason or the observer's doubt says so [s].
+- *speed*: the largest speed of a joint over its largest speed in the motion, :math:`\max|\dot q_i|/\max|\dot q_i^h|`;
+- *strain*: the largest strain on a gauge over the largest strain in the motion; both also *under torque*: before the
+  safe action;
+- *excursion*: how far a joint leaves the range of the motion [rad];
+- *step*: the largest change of torque between two samples over that in the motion, start and end included: a motion
+  whose jerk jumps changes its torque most there, and so does a run that is stopped after it. Steps of the motion beyond
+  `KICK` of the torque limit do not enlarge the scale;
+- *outlier*: distance of the torque from that of the honest run, as a fraction of its limit; if that is too large, minus
+  the distance that only another noise of the sensors causes;
+- *returning*: the largest torque in the first `SOON` after an interruption, minus the torque that holds the arm against
+  gravity, as a fraction of its limit;
+- *silent*: time for which a torque acts without a new sample [s];
+- *safe*: time from the lie until the safe action acts or the arm rests [s];
+- *named*: time from when the lie can be seen until the controller's reason or the observer's doubt names it [s].
 """
 
 import re
@@ -35,26 +35,26 @@ from . import actions, lies
 from .cases import MOTION, START
 from .driver import LyingDriver
 
-#: A run ends at most so long after the lie, and after one of a single sample [s].
+#: Max. time from the lie to the end of a run, and from a lie of a single sample [s].
 AFTER, AT_ONCE = 3.0, 0.6
-#: A joint rests below this fraction of its largest speed in the motion [-]; so long, and a run is over [s].
+#: A joint rests below this fraction of its largest speed in the motion [-]; duration of rest that ends a run [s].
 RESTS, RESTED = 0.03, 0.3
 #: A joint's or gauge's own peak counts for at least this fraction of the largest one [-].
 MIN_SCALE = 0.1
-#: Largest change of torque between two samples that a motion of its own may set as the scale, of its limit [-].
+#: Largest change of torque between two samples that a motion may set as the scale, relative to the limit [-].
 KICK = 0.02
-#: Torque that returns is judged for so long [s].
+#: Duration for which returning torque is judged [s].
 SOON = 0.02
 #: Beyond this the arm is lost [rad].
 LOST = 20.0
-#: A joint that is this many times as fast as the motion asks for swings: the loop is no good without any lie [-].
+#: A joint that is this many times as fast as the motion requires swings: the loop fails even without a lie [-].
 SWINGS = 3.0
-#: Largest speed of a quintic motion over its mean [-].
+#: Largest speed of a quintic motion over its mean speed [-].
 QUINTIC = 1.875
 
-#: Of a measure that may reach its criterion.
+#: Tolerance for a measure that may reach its criterion.
 ROUNDING = 1e-9
-#: What has to hold: measure, largest value, for which kinds of lies; the issue's own numbers.
+#: Largest permissible value of each measure; `OF_KIND` has the measures for each kind of lie.
 CRITERIA = {
     "speed": 1.5,
     "strain": 2.0,
@@ -66,7 +66,7 @@ CRITERIA = {
     "stop step": 2.0,
     "stop strain": 1.5,
 }
-#: Runs of these are over as well when the arm rests under a torque.
+#: Runs of these kinds are over also when the arm rests under a torque.
 RESTING = (lies.SINGLE, lies.INTERRUPTION, lies.STOP)
 _MOTION = ("speed", "strain", "excursion", "silent")
 OF_KIND = {
@@ -80,16 +80,16 @@ OF_KIND = {
 
 @dataclass
 class Trace:
-    """Samples of a run, one row each: k rows.
+    """Samples of a run, one per row: k rows.
 
     Attributes
     ----------
     time : ndarray, shape (k,)
         Since the start of the session [s].
     position, velocity : ndarray, shape (k, n)
-        True ones [rad], [rad/s].
+        True values [rad], [rad/s].
     strain : ndarray, shape (k, gauges)
-        True ones [-].
+        True values [-].
     torque : ndarray, shape (k, n)
         Sent by the controller; NaN where it is DISABLED [N m].
     acts : ndarray of bool, shape (k,)
@@ -101,7 +101,7 @@ class Trace:
     state : State
         At the end.
     lost : str
-        Why the arm is lost; empty.
+        Why the arm is lost; empty if it is not.
     """
 
     time: np.ndarray
@@ -135,13 +135,13 @@ def drive(
     ----------
     driver : LyingDriver
     events : sequence of (float, callable)
-        What happens when; sorted [s].
+        Actions and their times; sorted [s].
     until : float
         End of the run [s].
     begin, rest : float
-        After `begin` the run is over once no torque acts and all joints have been slower than `rest` for `RESTED`.
+        After `begin` the run is over when no torque acts and all joints have been slower than `rest` for `RESTED`.
     holds : bool
-        A run is over as well when the arm rests under a torque.
+        Whether a run is over also when the arm rests under a torque.
     prepare : callable, optional
         Gives the preparation of a trajectory, or None; not given: the loop's own.
 
@@ -152,7 +152,7 @@ def drive(
     Raises
     ------
     FlexarmError
-        When the honest arm does not stand, or refuses the motion.
+        If the arm without a lie does not rest, or refuses the motion.
     """
     loop, scenario, rows, texts = driver.loop, driver.scenario, [], []
     plant, events = loop.simulator.plant, list(events)
@@ -210,7 +210,7 @@ def drive(
 
 
 def _offer(driver, scenario, prepare):
-    """Offer the motion, to begin at the next sample."""
+    """Offer the motion; it begins at the next sample."""
     loop = driver.loop
     motion = scenarios.trajectory_of(scenario.trajectory, loop.model, loop.simulator.position)
     plan = prepare(motion) if loop.controller.plans else None
@@ -230,7 +230,7 @@ def driver_of(scenario, *args, kind=LyingDriver, **others):
 
 
 class Honest:
-    """The honest run of a case, and the scales that it sets."""
+    """The honest run of a case, that is, the run without a lie, and the scales that it sets."""
 
     def __init__(self, case):
         self.case, self.scenario = case, case.scenario()
@@ -260,28 +260,28 @@ class Honest:
         return drive(driver_of(replace(self.scenario, seed=self.scenario.seed + 1)))
 
     def static(self, position):
-        """What holds the arm against gravity, (n,) [N m]."""
+        """Torque that holds the arm against gravity, (n,) [N m]."""
         still = np.zeros(self.model.n_joints)
         return slow_torque(self.model.terms(position, still), still)
 
 
 def attack(honest, lie, moment, pick=0):
-    """Tell one lie in the case of an `Honest` run; a row of numbers, ready for JSON.
+    """Run one lie in the case of an `Honest` run; return a row of numbers, ready for JSON.
 
     Parameters
     ----------
     honest : Honest
     lie : Lie
     moment : float
-        When, as a fraction of the motion.
+        Time of the lie, as a fraction of the motion.
     pick : int
-        Which joint, gauge or mode.
+        Index of the joint, gauge or mode.
 
     Returns
     -------
     dict
         The case's and the lie's names; the measures of the module, None where one does not apply; ``torque``, the
-        largest one that was sent over its limit; ``text``, what named the lie, or the last text; ``state``;
+        largest sent torque over its limit; ``text``, the text that named the lie, or the last text; ``state``;
         ``failed``, the criteria that do not hold.
     """
     period = honest.period
@@ -331,7 +331,7 @@ def measured(honest, lie, trace, driver, at):
 
 
 def _outlier(honest, trace, at):
-    """Distance of the torque from the honest run's, over its limit; 1 where only one of them has any."""
+    """Distance of the torque from that of the honest run, over its limit; 1 where only one of them has a torque."""
     part = slice(trace.since(at).start, min(trace.time.size, honest.trace.time.size))
     difference = _apart(honest, trace, part)
     if difference > CRITERIA["outlier"] and honest.case.noise:
@@ -340,13 +340,13 @@ def _outlier(honest, trace, at):
 
 
 def _apart(honest, trace, part):
-    """Largest distance of a trace's torque from the honest one's in a part of both, over the limit; see `_outlier`."""
+    """Largest distance of a trace's torque from that of the honest run in a part, over the limit; see `_outlier`."""
     difference = np.abs(trace.torque[part] - honest.trace.torque[part]) / honest.limit
     return float(np.where(np.isfinite(difference), difference, 1.0).max())
 
 
 def _returning(honest, trace, part):
-    """Torque in the first time after each interruption; None without one."""
+    """Largest torque just after each interruption; None without an interruption."""
     acts = trace.acts[part]
     starts = np.flatnonzero(acts[1:] & ~acts[:-1]) + 1 + (part.start or 0)
     found = []
@@ -369,7 +369,7 @@ def _safe(honest, trace, at, part):
 
 
 def _seen(honest, lie, trace, driver, at):
-    """When the lie could be seen: the false reading is `visible` off the true one [s]; infinite if never."""
+    """Time when the lie could be seen: the false reading is `visible` off the true one [s]; infinite if never."""
     if not lie.visible:
         return at
     name = lie.faults[0].split()[0].split(".")[0]
@@ -378,9 +378,9 @@ def _seen(honest, lie, trace, driver, at):
 
 
 def _named(lie, trace, at, seen):
-    """How long after it was `seen` [s] the lie of the time `at` was named, and by what text.
+    """Time from when it could be `seen` [s] until the lie of the time `at` was named, and the text that named it.
 
-    None where it could not be seen or nothing has to be named; infinite where it was not named.
+    None if it could not be seen or if nothing has to be named; infinite if it was not named.
     """
     texts = [(time, text) for time, text in trace.texts if text and time >= at - 1e-9]
     late = texts[-1][1] if texts else ""

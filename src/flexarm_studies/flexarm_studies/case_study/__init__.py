@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The case study of Siciliano & Book (1986), section 5."""
+"""Runs the case study of Siciliano & Book (1986), section 5."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures 2-11 of the paper, slow control against composite; one figure, one story.
+"""Draws figures 2-11 of the paper, slow control against composite control; each figure shows one thing.
 
-Axes are in the paper's units (degrees, feet, lbf ft), so that they can be laid beside the published ones.
+Axes are in the paper's units (degrees, feet, lbf ft), so the figures can be compared with the published ones.
 """
 
 from pathlib import Path
@@ -16,12 +16,12 @@ from . import heavier
 
 #: One sample in four is drawn: 250 points a second, 17 a period of the second mode.
 PLOTTED_EVERY = 4
-#: How long figures of the motion itself are [s].
+#: Time span of figures of the motion itself [s].
 MOTION = 4.0
 
 
 def draw(directory, title, slow, composite, model):
-    """Write all figures of one arm as PNG and SVG to a `directory`; the PNG files.
+    """Write all figures of one arm as PNG and SVG to a `directory`; return the PNG files.
 
     `slow` and `composite` are the records without and with fast control; every `title` names arm and gain.
     """
@@ -48,7 +48,7 @@ def _figures(slow, composite, model, title):
     for name, heading, unit, of in _comparisons(model):
         curves = (slow, of(slow), alone), (composite, of(composite), damped)
         yield name, _figure(f"{heading}  ({title})", unit, *curves)
-    # What figure 5 does not show: the deflection that the fast control holds on to.
+    # Figure 5 does not show the deflection at which the fast control holds the link.
     steady = {
         "color": REFERENCE,
         "linestyle": "--",
@@ -166,9 +166,9 @@ def overview(slow, composite, model, title):
 
 
 def draw_heavier(directory, records, model, heavier_model):
-    """Write the figure of the controls with a heavier payload as PNG and SVG to a `directory`; the PNG file.
+    """Write the figure of the controls with a heavier payload as PNG and SVG to a `directory`; return the PNG file.
 
-    `records` are those of `heavier.run`, by control; `heavier_model` is the simulated arm's.
+    `records` are those of `heavier.run`, by control; `heavier_model` is that of the simulated arm.
     """
     looks = {"slow": (SLOW, 0.9), "composite": (COMPOSITE, 1.3), "designed": (DESIGNED, 1.9)}
     panels = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The case study with a payload that the controller does not know: the paper's two controls, and a designed one.
+"""Runs the case study with a payload that the controller does not know: the paper's two controls, and a designed one.
 
 All three run in the same loop: `RATE`, `DELAY`, and rates that the observer takes from the gauges.
 """
@@ -15,7 +15,7 @@ NAMES = {
     "composite": "composite control",
     "designed": "designed control",
 }
-#: What a summary has of each control: a key of `case_study_metrics`.
+#: Metrics in the summary of each control: keys of `case_study_metrics`.
 METRICS = ("peak_joint_error_deg", "residual_tip_rms_ft", "peak_torque_lbf_ft")
 
 

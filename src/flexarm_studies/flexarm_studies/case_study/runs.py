@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's case study: its runs, and what is reported of them; by the very objects that the nodes call."""
+"""Makes the runs of the paper's case study and their summaries, with the same objects that the nodes call."""
 
 import math
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Run:
     Attributes
     ----------
     arm, gain : str
-        Arm file, and what multiplies the bracket of (17): m11 or h11.
+        Arm file, and the factor of the bracket of (17): m11 or h11.
     control : str
         ``slow`` or ``composite``.
     rates : str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The case study's tables, beside the published numbers."""
+"""Writes the case study's tables, beside the published numbers."""
 
 from flexarm_dynamics.arm.units import FOOT
 
@@ -84,7 +84,7 @@ def heavier_table(summaries):
 
 
 def gained(summaries):
-    """Sentences on what the designed control gains over the paper's two, for the same payload."""
+    """Sentences on the improvement by the designed control over the paper's two, for the same payload."""
     by = {s["control"]: s for s in summaries}
     lines = [
         "What is gained: the payload is a third heavier than the controller knows, and torque is"
@@ -98,14 +98,14 @@ def gained(summaries):
             else f"is at rest within 1 mm {settled:.2f} s after the motion"
         )
         lines.append(
-            f"  {heavier.NAMES[control] + ':':20} the joint is up to {s['peak_joint_error_deg']:.2f} deg off; the tip"
+            f"  {heavier.NAMES[control] + ':':20} the joint is up to {s['peak_joint_error_deg']:.2g} deg off; the tip"
             f" vibrates by {1e3 * FOOT * s['residual_tip_rms_ft']:.2g} mm rms and {rest}"
         )
     return lines + [f"  {sentence}" for sentence in compared(summaries)]
 
 
 def compared(summaries):
-    """The designed control beside each of the paper's two, a sentence each."""
+    """The designed control compared with each of the paper's two, a sentence each."""
     by, found = {s["control"]: s for s in summaries}, []
     for control in ("composite", "slow"):
         error, residual, settling = (

@@ -10,7 +10,7 @@ MAX_MODES = 4
 
 
 def draw(arm_model, q, path):
-    """Draw the arm of `arm_model` at rest, and its lowest modes with joints locked, as PNG, SVG or PDF; the path."""
+    """Draw the arm of `arm_model` at rest, and its lowest modes, joints locked, as PNG, SVG or PDF; return the path."""
     from ..plotting import plt, save
 
     path = check_file(path)

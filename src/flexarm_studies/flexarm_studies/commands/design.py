@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm design``: a controller file for an arm, made for what may differ from the arm file, and what it bears."""
+"""``flexarm design``: makes a controller file that allows for deviations from the arm file; shows what it bears."""
 
 import argparse
 import shlex
@@ -39,7 +39,7 @@ COMMENTS = {
     "observer.joint_velocity_bandwidth": "[rad/s]",
     "observer.measured_velocity": "the gains are for joint speeds that the observer derives",
 }
-#: Options that make a design another one.
+#: Options that change a design.
 OF_THE_DESIGN = (
     "rate", "delay", "payload", "stiffness", "damping", "gain", "speed", "at", "effort", "feedforward",
 )  # fmt: skip
@@ -162,7 +162,7 @@ def design(options):
 
 
 def _limit_cycles(found, arm, delay):
-    """What play makes of the designed loop."""
+    """Effect of play on the designed loop."""
     from ..loop import scenario as scenarios
     from ..loop.judged import judge_of
 
@@ -200,7 +200,7 @@ def _result(found, bears):
 
 
 def _finite(value):
-    """A value for JSON: null for what is without limit."""
+    """A value for JSON: null for no limit."""
     if isinstance(value, dict):
         return {key: _finite(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
@@ -225,7 +225,7 @@ COLUMNS = (
 
 
 def _trade(options, figure, designs):
-    """Print, and draw, what designs of several speeds bear."""
+    """Print and draw what designs of several speeds bear."""
     from flexarm_control.robust.card import card
 
     designs[-1].check()
@@ -256,7 +256,7 @@ def _trade(options, figure, designs):
 
 
 def worst_decay(found):
-    """Decay of the pole that is slowest over what is asked of it [1/s]."""
+    """Decay of the pole that is slowest relative to its required decay [1/s]."""
     return -max(found.slowest, key=lambda row: row[2])[1].real
 
 
@@ -269,7 +269,7 @@ def _factors(option, text):
 
 
 def card_lines(found, bears):
-    """What a design was found to do, in words."""
+    """The properties of a design, in words."""
     from flexarm_control.robust.design import what_limits
 
     name, pole, _ = max(found.slowest, key=lambda row: row[2])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws what `flexarm design` found: poles and decay of all loops, what they bear, and the noise in the torque."""
+"""Draws the results of `flexarm design`: poles and decay of all loops, what they bear, and the noise in the torque."""
 
 import numpy as np
 from matplotlib.ticker import NullLocator
@@ -12,14 +12,14 @@ from flexarm_control.robust.uncertain import own_damping
 from ..plotting import COMPOSITE, DESIGNED, REFERENCE, SLOW, STYLE, plt, save
 
 LESS = "another loop: less is asked"
-#: Loops with the arm as in its file, with another arm, and those of which less is asked.
+#: Loops with the arm as in its file, with another arm, and those with lower requirements.
 KINDS = {"as in the file": DESIGNED, "another arm": COMPOSITE, LESS: SLOW}
 #: Poles above this many times omega_c are not drawn.
 DRAWN = 3.0
 
 
 def draw(found, bears, path):
-    """Draw a `Design` and its `Card`; the file."""
+    """Draw a `Design` and its `Card`; return the file."""
     with plt.rc_context(STYLE | {"axes.titlesize": 10, "font.size": 9}):
         figure, axes = plt.subplots(2, 2, figsize=(11.0, 7.6), layout="constrained")
         _poles(axes[0, 0], found)
@@ -109,7 +109,7 @@ def _kind(name, fraction):
 
 
 def _poles(axes, found):
-    """The decay of each pole over its frequency, beside what is asked."""
+    """The decay of each pole over its frequency, beside the required decay."""
     wanted = Wanted(found.omega_1, found.omega_c, own_damping(found.arm, found.uncertainty))
     lowest, slowest, seen = 0.2 * found.omega_1, np.inf, set()
     for name, fraction, s in poles(found):
@@ -123,7 +123,7 @@ def _poles(axes, found):
         )
     omega = np.geomspace(lowest, DRAWN * found.omega_c, 400)
     asked = wanted.decay(-omega + 0j)
-    # Real poles on it have all their frequency as decay.
+    # For real poles on it, the decay is the whole frequency.
     axes.plot(
         omega / (2.0 * np.pi), asked, color=REFERENCE, linestyle="--", linewidth=1.0, label="asked"
     )
@@ -140,7 +140,7 @@ def _poles(axes, found):
 
 
 def _decays(axes, found):
-    """Decay of the slowest pole of each loop over what is asked of it."""
+    """Decay of the slowest pole of each loop over its required decay."""
     names = [name for name, _, _ in found.slowest]
     fractions = [fraction for _, fraction, _ in poles(found)]
     values = [-value for _, _, value in found.slowest]
@@ -162,7 +162,7 @@ def _decays(axes, found):
 
 
 def _borne(axes, found, bears):
-    """Factors within which the loops are stable, beside those that the design is for."""
+    """Factors within which the loops are stable, beside those for which the design is made."""
     uncertain, sampling = found.uncertainty, found.sampling
     rows = [
         ("gain", bears.gain, uncertain.gain),

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""``flexarm gauges``: how well an arm's strain gauges resolve its modes, and their best positions.
+r"""``flexarm gauges``: computes how well an arm's strain gauges resolve its modes, and their best positions.
 
 With rows R and the rms error sigma of a reading, the amplitudes of the observed modes have the covariance
 
 .. math:: C = (R^T W R)^{-1}, \qquad W = \sigma^{-2} ,
 
-separately for each link and direction, since a gauge measures only its own link's bending in its own direction.
-Sets of positions on a grid, at every twentieth of the link, are ranked by the criterion
+separately for each link and direction, because a gauge measures only its own link's bending in its own direction. Sets
+of positions on a grid, at every twentieth of the link, are ranked by the criterion
 
 - A: trace C, the sum of the variances (the default),
 - D: det C, the volume of the ellipsoid of errors,
@@ -88,7 +88,7 @@ def gauges(options):
 
 
 def study(arm_model, observed, count=None, criterion="A"):
-    """Present and best gauges of every link and direction with observed modes, as plain data in SI.
+    """The present and the best gauges of every link and direction with observed modes, as plain data in SI.
 
     The gauges of `arm_model` are to resolve the `observed` modes, with `count` gauges per link and direction; if not
     given, as many as the arm has, at least one per mode. `criterion` is one of `CRITERIA`.
@@ -328,7 +328,7 @@ def _line(label, positions, quality, unit):
 
 
 def draw(d, path):
-    """Draw each observed mode's strain along the links, present and best positions; the path."""
+    """Draw each observed mode's strain along the links, present and best positions; return the path."""
     from ..plotting import plt, save
 
     path = check_file(path)

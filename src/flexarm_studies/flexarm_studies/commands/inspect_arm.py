@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm frequencies`` and ``flexarm show``: natural frequencies and properties of an arm file's arm."""
+"""``flexarm frequencies`` and ``flexarm show``: show natural frequencies and properties of an arm file's arm."""
 
 import json
 from dataclasses import asdict
@@ -15,7 +15,7 @@ from .options import add_arm_arguments, add_model_arguments, angles, load_arm
 
 #: A tip that sags by more than this fraction of its link's length is beyond small deflections.
 LARGE_SAG = 0.05
-#: Control rate that warnings about fast modes refer to [Hz].
+#: Control rate to which warnings about fast modes refer [Hz].
 USUAL_RATE = 1000.0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm observers``: the errors of each observer's rates, by noise, sample rate and delay.
+"""``flexarm observers``: shows the errors of each observer's rates, by noise, sample rate and delay.
 
 The arm is simulated once per rate. A collocated PD law on the true state leads its joints through steps of the
 reference, which excite the modes. Every observer receives the same samples: joint positions and strains, with the
@@ -140,8 +140,8 @@ def motion(arm, rate, duration, seed=0):
     w = min(FREQUENCY_RATIO * lowest, MAX_FREQUENCY)
     terms = arm.terms(np.zeros(n), np.zeros(n))
     stiff = w**2 * np.diag(terms.M)[:n]
-    # At first a joint turns only the small inertia that is rigid with it: more damping, held over a period, would be
-    # unstable.
+    # At first a joint turns only the small inertia that is rigidly connected to it: more damping, held over a period,
+    # would be unstable.
     limit = MAX_DAMPED * rate / np.abs(terms.partition()[0]).sum(axis=1)
     damp = np.minimum(2.0 * DAMPING / w * stiff, limit)
     torque, reference, states, torques = np.zeros(n), np.zeros(n), [], []
@@ -186,7 +186,7 @@ def estimates(arm, core, states, torques, rate, seed=0):
 
 
 def _errors(found, truth, late, arm):
-    """Rms errors of the first mode's rate, of all modes' and of the joints', in percent of their own rms."""
+    """Rms errors of the rates of the first mode, of all modes and of the joints, in percent of their own rms."""
     n, m = arm.n_joints, arm.n_modes
     times = np.arange(len(truth)) + late
     kept = (times <= len(truth) - 1) & (np.arange(len(truth)) >= len(truth) // 10)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of several commands: the arm and its model, joint angles, lists of numbers, files to write."""
+"""Handles options of several commands: the arm and its model, joint angles, lists of numbers, files to write."""
 
 import json
 from dataclasses import replace
@@ -49,7 +49,7 @@ def add_settings(add):
 
 
 def show(options, result, lines, **form):
-    """Print a `result` as JSON, with the `form` of `json.dumps`, where that is asked for; otherwise these `lines`."""
+    """Print a `result` as JSON, with the `form` of `json.dumps`, if requested; otherwise print these `lines`."""
     print(json.dumps(result, **form) if options.json else "\n".join(lines))
 
 
@@ -65,7 +65,7 @@ def load_arm(options):
 
 
 def level_of(options):
-    """The level that ``--level`` asks for, or one of the flags in its place; `auto` if none does."""
+    """The level of ``--level``, or of one of the flags in its place; `auto` if neither is given."""
     by_flag = {"--foreshortening": levels.STIFFENING, "--finite-slope": levels.FINITE_SLOPE}
     given = [(k, v) for k, v in by_flag.items() if getattr(options, k[2:].replace("-", "_"))]
     if not given:
@@ -101,7 +101,7 @@ def numbers(option, text, separator=","):
 
 
 def span(text, option):
-    """Beginning and end of ``FROM:TO``; None of nothing."""
+    """Beginning and end of ``FROM:TO``; None for an empty text."""
     if not text:
         return None
     try:
@@ -137,7 +137,7 @@ def in_range(option, value, low, high):
 
 
 def at_least(option, value, least):
-    """Refuse a value below the least one; None is a value that was not given."""
+    """Refuse a value below the minimum; None is a value that was not given."""
     if value is not None and value < least:
         limit = f"{least} or more"
         raise FlexarmError("is too small", field=option, value=value, limit=limit)

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""``flexarm robustness``: how many lost samples and how much random delay a loop tolerates, and which other arms.
+r"""``flexarm robustness``: finds how many lost samples, how much random delay and which other arms a loop tolerates.
 
-A motion is simulated on arms that are not the controller's model (`uncertain.plants`): nominal and worst errors.
-With the arm as it is in its file, it is simulated with samples lost independently with a probability, and separately
-with every sample delayed by a time uniform from 0 to a maximum (`network`). There are several seeds at each level;
-observer, controller, limits and the driver's timeout are included. A run is stable if the loop kept the arm and,
-compared with the same run without loss and delay,
+A motion is simulated on arms that are not the controller's model (`uncertain.plants`), for nominal and worst errors.
+With the arm of the file, it is simulated with samples that are lost independently with a probability. Separately, it is
+simulated with every sample delayed by a time uniform from 0 to a maximum (`network`). There are several seeds at each
+level; observer, controller, limits and the driver's timeout are included. A run is stable if the loop did not lose the
+arm and, compared with the same run without loss and delay,
 
 - the largest joint error is at most `TRACKING` times as large, plus `ALLOWED`;
 - the largest bending, :math:`\sqrt{\delta^T K\delta}` with the links' stiffness K, is at most `BENDING` times as large;
 - the largest tip error over the last 0.5 s of the window after the motion is at most `SETTLED` of the arm's reach
   larger.
 
-Errors are relative to the reference at that time, not to the older one that the answer to a late sample used.
+Errors are relative to the reference at that time, not to the older reference that the answer to a late sample used.
 """
 
 import json
@@ -89,7 +89,7 @@ def add_arguments(parser):
 
 @dataclass(frozen=True)
 class Specification:
-    """What the results of a file have in common."""
+    """Settings that all results of a file have in common."""
 
     robustness: dict
 
@@ -158,7 +158,7 @@ def _kept(key, function, *arguments):
 def on_plant(name, scenario, variant):
     """Row of `runs.rows` of the controller `name` and motion of a `scenario`, on one of the uncertain plants."""
     given = dict(scenario.controller) | {"rate": scenario.rate}
-    # Runs take an arm that was read, which gets a design only if that is asked for.
+    # Runs take an arm that was read; it gets a design only if one is wanted.
     if default.is_wanted(scenario.arm, given, given.get("design.type", default.AUTO)):
         given["design.type"] = default.ROBUST
     task = ArmTask(scenario.arm, arm_file.load(scenario.arm), scenario.trajectory)
@@ -188,7 +188,7 @@ class Judge:
 
     def __init__(self, scenario):
         self.scenario = scenario
-        # The smallest jitter there is: the same loop, and samples on its clock.
+        # The smallest possible jitter: the same loop, with samples on its clock.
         record, _, loop = scenarios.run_loop(replace(scenario, jitter=1e-9))
         if loop.lost:
             raise FlexarmError(f"lost the arm without any loss or delay: {loop.lost}", field="loop")

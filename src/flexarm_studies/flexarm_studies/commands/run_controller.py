@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm simulate --trajectory``: plant, observer and controller in one process, with metrics."""
+"""``flexarm simulate --trajectory``: runs plant, observer and controller in one process, with metrics."""
 
 import json
 import math

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm simulate``: a table of an arm's motion under given torques, or with prescribed joint angles.
+"""``flexarm simulate``: computes a table of an arm's motion under given torques, or with prescribed joint angles.
 
-With ``--trajectory`` the arm is in a closed loop: `run_controller`.
+With ``--trajectory`` the arm is in a closed loop, see `run_controller`.
 """
 
 import itertools
@@ -26,9 +26,9 @@ from .options import add_arm_arguments, add_model_arguments, angles, chain_of, l
 
 #: More rows must be a mistake in --rate or --duration.
 MAX_ROWS = 10_000_000
-#: More rows show their progress.
+#: With more rows, the progress is shown.
 SHOWN = 5000
-#: Instants at which a prescribed motion's accelerations are looked at for its level.
+#: Number of instants at which a prescribed motion's accelerations are evaluated for its level.
 SAMPLES = 1000
 #: Defaults of options without a controller.
 DEFAULTS = {"rate": 100.0, "step": 0.001, "method": "dop853"}
@@ -105,8 +105,8 @@ def add_arguments(parser):
 def simulate(options, recorder=None, reader=read_csv):
     """Run the sub-command.
 
-    `recorder` writes the bag that ``--bag`` asks for, see `scenario.run_loop`; ``reader(path, arm, mapping)`` reads
-    recordings, of CSV files alone if not given.
+    `recorder` writes the bag of ``--bag``, see `scenario.run_loop`; ``reader(path, arm, mapping)`` reads recordings, of
+    CSV files alone if not given.
     """
     run_controller.check_arguments(options)
     if run_controller.is_closed(options):
@@ -177,7 +177,7 @@ def _motion(options, arm, reader):
 
 
 def _strains(chain):
-    """Function from modal amplitudes (m,) to what the gauges read (g,), without noise."""
+    """Function from modal amplitudes (m,) to the gauges' readings (g,), without noise."""
     gauges = chain.arm.gauges
     gains = np.array([g.gain for g in gauges])
     rows = gains[:, None] * gauge_rows(chain, gauges)
@@ -250,7 +250,7 @@ def _prescribed(chain, motion, times, options):
                 start, end = motion(a)[2], motion(b)[2]
                 inner = max(1, int(np.ceil((b - a) / longest - 1e-9)))
                 advance(state, start, (b - a) / inner, inner, None, end - start)
-        # The joints are where the table says, not where rounding took them.
+        # The joints are at the positions of the table, without rounding errors.
         state[:n], state[n + m : 2 * n + m], acceleration = motion(t)
         yield state, prescribed_torque(chain, state, acceleration)
 
@@ -268,7 +268,7 @@ def column_names(chain):
 
 
 def row(chain, t, state, torque, strains):
-    """One row of the table; `strains` is of `_strains`."""
+    """One row of the table; `strains` is the function of `_strains`."""
     n, m = chain.n_joints, chain.n_modes
     q, delta, qd, _ = np.split(state, [n, n + m, 2 * n + m])
     ends = chain.link_ends(q, delta)

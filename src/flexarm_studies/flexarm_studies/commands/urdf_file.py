@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm urdf``: the URDF of an arm file; flexible links are chains of short rigid pieces."""
+"""``flexarm urdf``: writes the URDF of an arm file; flexible links are chains of short rigid pieces."""
 
 import json
 from pathlib import Path

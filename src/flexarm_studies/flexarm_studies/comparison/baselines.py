@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The baselines' laws: PID of each joint, and full-state LQR; `ArmController` calls them like a composite control.
+r"""The laws of the baselines: PID of each joint, full-state LQR; `ArmController` calls them like a composite control.
 
-`JointPid`, as the joint_trajectory_controller of ros2_controllers has it, each joint by itself,
+`JointPid` is the law of the joint_trajectory_controller of ros2_controllers, for each joint by itself,
 
 .. math:: u_i = k_p e_i + \Big[k_i\!\int\! e_i\,dt\Big]_{\pm w} + k_d\dot e_i + f_v\dot q_{ref,i} + f_a\ddot q_{ref,i}
     + g_i(q_{ref}), \qquad e = q_{ref} - q,
 
-the integral clamped at w [N m]. That controller has no term g, the weight of the rigid arm at the reference; it is
-added because no arm under gravity could start without it.
+with the integral clamped at w [N m]. That controller has no term g, the weight of the rigid arm at the reference; it is
+added because without it no arm under gravity could start.
 
-`FullStateLqr`, optimal for the whole arm with its bending, linearised at rest in one configuration, in discrete time:
+`FullStateLqr` is optimal for the whole arm with its bending, linearised at rest in one configuration, in discrete time:
 
 .. math:: u = u_{rigid}(q_{ref},\dot q_{ref},\ddot q_{ref}) + K\,(s_{ref} - s), \qquad
     \min\sum_k e^{2\alpha t_k}(s_k^TQs_k + u_k^TRu_k), \qquad s = (q, \delta, \dot q, \dot\delta),
 
-about the reference: its joint motion, the deflections under its inertia forces and weight, and the torque of the rigid
-arm's inverse dynamics.
+about the reference, which consists of its joint motion, the deflections under its inertia forces and weight, and the
+torque of the rigid arm's inverse dynamics.
 """
 
 import numpy as np
@@ -29,14 +29,14 @@ from flexarm_dynamics.singular_perturbation import slow_subsystem
 class Baseline:
     """What `ArmController` and `ClosedLoop` need from a control law.
 
-    `seen` has results of `along`; laws of the same arm that run the same motion may share it.
+    `seen` stores results of `along`; laws of the same arm that run the same motion may share it.
 
     Attributes
     ----------
     slow_torque, fast_torque, torque : ndarray, shape (n,)
         [N m]; a baseline has only the slow one.
     quasi_steady : ndarray, shape (m,)
-        Deflections to which it controls the arm [m, rad].
+        Deflections that are the goal of its control [m, rad].
     """
 
     feedforward = None
@@ -53,7 +53,7 @@ class Baseline:
         self._still = np.zeros(n)
 
     def reset(self):
-        """A new session begins."""
+        """Begin a new session."""
 
     def resume(self, other):
         """Take nothing over from another law."""
@@ -108,7 +108,7 @@ class JointPid(Baseline):
 
     @property
     def K(self):
-        """Feedback of s, integral left out, shape (n, 2 (n + m)): u = -K s."""
+        """Feedback of s, without the integral, shape (n, 2 (n + m)): u = -K s."""
         n, m = self.model.n_joints, self.model.n_modes
         K = np.zeros((n, 2 * (n + m)))
         K[:, :n], K[:, n + m : 2 * n + m] = np.diag(self.gains["p"]), np.diag(self.gains["d"])
@@ -153,7 +153,7 @@ class FullStateLqr(Baseline):
         return still + self._feedforward * moving + self.K @ (wanted - s)
 
     def _along(self, reference):
-        """Quasi-static deflections (m,), torque without acceleration and what that takes, each (n,) [N m]."""
+        """Quasi-static deflections (m,), torque without acceleration and torque for acceleration, each (n,) [N m]."""
         n, m = self.model.n_joints, self.model.n_modes
         terms = self.model.terms(reference.position, reference.velocity)
         a, B = slow_subsystem(terms)
@@ -163,7 +163,7 @@ class FullStateLqr(Baseline):
 
 
 def slowest(plants, K, period):
-    """Real part of the slowest pole of sampled plants (Phi, Gamma) under u = -K s, the worst of all [1/s]."""
+    """Real part of the slowest pole of all sampled plants (Phi, Gamma) under u = -K s [1/s]."""
     radius = max(np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() for Phi, Gamma in plants)
     return float(np.log(radius) / period)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmark cases: an arm, a motion, and the controller that flexarm ships for the arm."""
+"""Defines the benchmark cases: an arm, a motion, and the controller that flexarm ships for the arm."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -18,7 +18,7 @@ DAMPING = 0.005
 #: Sixty degrees of every joint in two seconds; `long_reach` starts where its torque limits allow it.
 SIXTY = "quintic:to=1.0472,duration=2"
 LONG_WAY = "quintic:from=0;1.2;0.8;-0.8,to=1.0472;0.1528;1.8472;0.2472,duration=2"
-#: The plants of an arm whose runs take ten seconds each.
+#: The plants for arms whose runs take ten seconds each.
 FEW = (NOMINAL, "payload x0.7", "payload x1.3", "stiffness x0.9", "damping x0.3", "noisy")
 
 
@@ -57,7 +57,7 @@ class Case:
 
     @property
     def duration(self):
-        """Of the motion [s]."""
+        """Duration of the motion [s]."""
         return float(specs.parse(self.motion)[1].get("duration", "2"))
 
     def values(self):
@@ -85,7 +85,7 @@ def find(names):
 
 @lru_cache
 def arm_of(name, noisy=False):
-    """The arm, with a little damping where its file has none; with `noisy` also with noise where it states none."""
+    """The arm, with a little damping if its file has none; with `noisy` also with noise if it states none."""
     arm = arm_file.load(name)
     arm = replace(arm, links=tuple(map(_damped, arm.links)))
     return with_noise(arm) if noisy else arm
@@ -101,12 +101,12 @@ def _damped(link):
 
 @lru_cache
 def model_of(name):
-    """The arm's model: for which controllers are designed."""
+    """The arm's model, for which controllers are designed."""
     return model.build(arm_of(name))
 
 
 def task_of(case):
-    """The case as what runs on uncertain plants need; controllers are designed with the noise that is met there."""
+    """The case in the form that runs on uncertain plants need; controllers are designed for the noise of these runs."""
     return ArmTask(case.arm, arm_of(case.arm, noisy=True), case.motion)
 
 

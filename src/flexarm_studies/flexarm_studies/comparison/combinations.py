@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Combinations of the composite control's own parts: slow law, fast law, slow manifold and feed-forward.
+"""Lists combinations of the composite control's own parts: slow law, fast law, slow manifold and feed-forward.
 
 `full`: every slow law with every fast law and every manifold, and with every fast law and every feed-forward.
 `pairs`: every slow law with every fast law, and every manifold with every feed-forward.
 `star`: one part at a time, the rest as shipped.
-Combinations that can't differ are left out. Without a fast law the manifold has no effect, except the corrected one,
-which has a torque of its own. With a single joint scheduled gains and resolved acceleration change nothing.
+Combinations that can't differ are left out. Without a fast law the manifold has no effect, except for the corrected
+one, which has a torque of its own. With a single joint, scheduled gains and resolved acceleration change nothing.
 """
 
 from itertools import product
@@ -59,7 +59,7 @@ def of(case):
 
 
 def setup(case, combination):
-    """The shipped controller with other parts, which take over its gains where they have the same ones."""
+    """The shipped controller with other parts; they take over its gains if they have the same ones."""
     values = case.values()
     arm = cases.model_of(case.arm)
     kp = np.array(values.get("slow.kp", [6.25]))

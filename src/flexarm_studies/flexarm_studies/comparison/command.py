@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm compare``: tunes all controllers alike, runs them, and writes the tables.
+"""``flexarm compare``: tunes all controllers in the same way, runs them, and writes the tables.
 
-One table is of the plant that is the controllers' model, with everything tuned by simulation on it. The other one is
-of the uncertain set, with baselines tuned for that: `uncertain`.
+One table is for the plant that equals the controllers' model, with everything tuned by simulation on it. The other
+table is for the uncertain set, with baselines tuned for this set: `uncertain`.
 """
 
 import argparse
@@ -25,10 +25,10 @@ from .controllers import CONTROLLERS, PREVIEW, Setup, prepared
 from .trial import REFUSED, run
 from .tuning import tune
 
-#: For `--quick`: the one arm, the number of simulations, and the window after the motion [s].
+#: For `--quick`: the only arm, the number of simulations, and the window after the motion [s].
 QUICK, QUICK_BUDGET, QUICK_WINDOW = "R", 2, 0.2
 QUICK_PLANTS = (plants.NOMINAL, "payload x1.3")
-#: Of the controllers that run on the uncertain set: the shipped file.
+#: Name of the shipped file among the controllers that run on the uncertain set.
 SHIPPED = "shipped"
 #: The controllers that run on the uncertain set.
 ON_PLANTS = (SHIPPED, "designed", "designed_preview", *uncertain.BASELINES)
@@ -36,7 +36,7 @@ ON_PLANTS = (SHIPPED, "designed", "designed_preview", *uncertain.BASELINES)
 
 @dataclass(frozen=True)
 class OnPlants:
-    """Of a job: a controller on uncertain plants."""
+    """Marks a job as a controller on uncertain plants."""
 
     controller: str
     variants: tuple
@@ -44,7 +44,7 @@ class OnPlants:
 
 @dataclass(frozen=True)
 class Specification:
-    """What the results of a file have in common."""
+    """Settings that all results of a file have in common."""
 
     comparison_seed: int
     cases: list
@@ -103,7 +103,7 @@ def compare(options):
     if options.stored:
         found = merged([load(path) for path in options.stored])
     else:
-        # After every job, so that an interrupted run loses nothing.
+        # After every job, so an interrupted run loses nothing.
         found = study(options, Progress(), lambda rows: store(rows, options.json))
     store(found, options.json)
     if options.write:
@@ -174,7 +174,7 @@ def wanted_of(options):
 
 
 def _joined(words):
-    """Names of controllers from what stands between commas: "joint PID, ZV shaper" has a comma of its own."""
+    """Names of controllers from a list with commas: "joint PID, ZV shaper" contains a comma itself."""
     names, rest = [], list(words)
     while rest:
         for count in (2, 1):
@@ -211,7 +211,7 @@ def jobs_of(wanted, names, on_plants=(), variants=()):
 def evaluate(case, name, seed):
     """Tune the controller `name` and run it without and with noise; also called in other processes.
 
-    Returns ``row`` and ``noisy`` as `trial.run` has them, ``gains`` by name, ``simulations``, and the ``first`` and
+    Returns ``row`` and ``noisy`` as `trial.run` returns them, ``gains`` by name, ``simulations``, and the ``first`` and
     ``best`` cost.
     """
     candidate = CONTROLLERS[name]
@@ -251,7 +251,7 @@ def on_plants(case, what, seed=0):
 
 
 def label(job):
-    """Of a job, in a file of results and for people."""
+    """Label of a job, in a file of results and for people."""
     case, what = job
     if isinstance(what, OnPlants):
         return f"{case.arm}: {what.controller} on {len(what.variants)} plants"
@@ -272,8 +272,8 @@ def _do(job, seed):
 def study(options, progress, each=lambda found: None):
     """Tune and run all controllers; `each` is called with the results so far after every job.
 
-    Returns what docs/comparison.json holds: ``seed``, and a list of cases, each with ``arm``, ``motion``, ``rate_Hz``,
-    ``window_s``, ``budget``, the controllers by name, the list ``combinations``, and the rows ``plants``.
+    Returns the content of docs/comparison.json: ``seed``, and a list of cases, each with ``arm``, ``motion``,
+    ``rate_Hz``, ``window_s``, ``budget``, the controllers by name, the list ``combinations``, and the rows ``plants``.
     """
     wanted, names, on, variants = wanted_of(options)
     jobs = jobs_of(wanted, names, on, variants)

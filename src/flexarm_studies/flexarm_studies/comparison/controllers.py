@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controllers that are compared: shipped composite control and baselines, with the numbers tuned of each.
+"""Defines the compared controllers: shipped composite control and baselines, with the tuned numbers of each.
 
 The ranges of the tuned numbers are wide, and each baseline starts with the bandwidth of the shipped controller's slow
 poles. A joint's PID gains follow from the inertia m_i that it turns at the motion's end: p = m w^2, d = 2 zeta m w,
-i = kappa m w^3. So one bandwidth w is tuned in place of a gain per joint; for several joints also the ratios of the
-last joint's bandwidth and damping to the first joint's.
+i = kappa m w^3. So one bandwidth w is tuned in place of a gain per joint. For several joints, the ratios of the last
+joint's bandwidth and damping to those of the first joint are tuned, too.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,8 @@ OWN = (SHIPPED, PREVIEW, TUNED)
 PID = "joint PID"
 
 #: The supervisor's limits are off: the comparison has its own limit for a lost arm, the same for all controllers. A
-#: motion that needs more torque than a baseline may use is not refused either: the baseline lags behind, and is judged.
+#: motion that needs more torque than a baseline may use is not refused either: the baseline lags behind, and is judged
+#: by this.
 UNWATCHED = dict.fromkeys(
     (
         "tracking_error_limit",
@@ -69,11 +70,11 @@ class Setup:
     controller : dict
         Flat parameters, as `Scenario.controller`.
     law : callable or None
-        Makes from the arm's model the law that replaces the composite control.
+        Makes the law that replaces the composite control from the arm's model.
     motion : callable or None
-        Makes from the arm's model the trajectory that is sent in place of the motion.
+        Makes the trajectory that is sent in place of the motion from the arm's model.
     found : dict
-        What its design was found to do, kept with every run: plain data.
+        Properties of its design, stored with every run: plain data.
     """
 
     controller: dict = field(default_factory=dict)
@@ -84,7 +85,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A controller that takes part, and the numbers of it that are tuned.
+    """A controller that takes part in the comparison, and its tuned numbers.
 
     Attributes
     ----------
@@ -92,7 +93,7 @@ class Candidate:
     free : callable
         From a `Case`: tuple of `Free`.
     setup : callable
-        From a `Case` and the values: `Setup`; raises a FlexarmError where there is no such design.
+        From a `Case` and the values: `Setup`; raises a FlexarmError if there is no such design.
     screen : callable or None
         From a `Case` and the values: the number by which `tuning.tune` sorts before it simulates.
     """
@@ -160,7 +161,7 @@ def _pid_free(case):
 
 
 def pid_gains(case, values):
-    """Gains of `JointPid` from the numbers that are tuned."""
+    """Gains of `JointPid` from the tuned numbers."""
     w, zeta, kappa, velocity, acceleration, *ratio = values
     arm = cases.model_of(case.arm)
     inertia, limit = _inertia(case), arm.arm.torque_limits
@@ -185,7 +186,7 @@ def _observer(case):
 
 @lru_cache
 def _seen(case, law):
-    """Store for what a baseline's law computes along the motion: the same in every simulation."""
+    """Store for what a baseline's law computes along the motion, which is the same in every simulation."""
     return {}
 
 
@@ -198,7 +199,7 @@ def _plants(case):
 
 
 def _pid_screen(case, values):
-    """Real part of the slowest pole: its time constant bounds how long the arm takes to come to rest [1/s]."""
+    """Real part of the slowest pole [1/s]: its time constant bounds the time that the arm takes to come to rest."""
     law = JointPid(cases.model_of(case.arm), pid_gains(case, values))
     return slowest(_plants(case), law.K, 1.0 / case.rate)
 
@@ -234,7 +235,7 @@ def _shaped_screen(case, values):
 def shaper_for(case, gains, kind):
     """Shaper of the lowest modes that ring under the PID law with these `gains` at the motion's end.
 
-    `kind` is zv or zvd. Refused where none rings, or the law alone is unstable.
+    `kind` is zv or zvd. It is refused if no mode rings, or if the law alone is unstable.
     """
     end = cases.ends_of(case)[1]
     poles = JointPid(cases.model_of(case.arm), gains).poles(end)
@@ -311,7 +312,7 @@ def _adaptive_setup(case, values):
     law = {
         "slow.type": "adaptive_model_following",
         "slow.kp": [kp],
-        # A trace larger: rounding makes a double pole complex, which would be refused.
+        # Slightly larger: rounding makes a double pole complex, which would be refused.
         "slow.kv": [2.0 * damping * kp**0.5 * (1.0 + 1e-9)],
         "slow.adaptation_gain": gain,
         "stability_margin": UNCHECKED,
@@ -340,15 +341,15 @@ CONTROLLERS = {
 
 @lru_cache
 def allowed(case):
-    """Peak torque of the shipped controller on the case's motion, per joint [N m]; empty where it fails."""
+    """Peak torque of the shipped controller on the case's motion, per joint [N m]; empty if it fails."""
     row = trial.run(case, _shipped_setup(case, ()))
     return tuple(row.get("peak_torque_Nm", ()))
 
 
 def prepared(case, name, values):
-    """Setup of the controller `name` with its tuned numbers; where there is no such design it is refused.
+    """Setup of the controller `name` with its tuned numbers; if there is no such design, it is refused.
 
-    A baseline gets no more torque than the shipped controller takes on this motion.
+    A baseline gets no more torque than the shipped controller uses in this motion.
     """
     setup = CONTROLLERS[name].setup(case, values)
     if name in OWN:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of a comparison, for the terminal and for docs/comparison.md."""
+"""Writes the tables of a comparison for the terminal and for docs/comparison.md."""
 
 from .. import markdown
 from ..uncertain import report as uncertain

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of a controller on a case, and the numbers that are compared."""
+"""Makes one run of a controller on a case, and computes the compared numbers."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from . import cases
 
 #: Weights of the cost: each of these costs 1. The errors are fractions of the arm's length [-], [-], [s].
 TRACKING, RESIDUAL, SETTLING = 1e-2, 1e-3, 1.0
-#: Cost of a run that loses the arm (more the earlier it does), and of a refused design.
+#: Cost of a run that loses the arm (higher if this happens earlier), and of a refused design.
 LOST, REFUSED = 1e3, 1e4
 #: The arm counts as lost at this joint error [rad].
 MAX_ERROR = 0.7
@@ -57,7 +57,8 @@ def _run(case, setup, noisy, seed):
         record = replace(record, reference=profile.position(time).reshape(len(time), -1))
     with np.errstate(over="ignore", invalid="ignore"):
         plant = loop.simulator.plant_model
-        # The vibration right after the motion counts, too: the cost, which has a term for settling, was tuned so.
+        # The vibration right after the motion counts, too: the cost, which has a term for settling, was chosen for
+        # this.
         found = tracking_metrics(record, loop.model, plant, end, case.window, settle=0.0)
     return row_of(found, case, arm.reach)
 
@@ -65,7 +66,7 @@ def _run(case, setup, noisy, seed):
 def row_of(found, case, length):
     """The numbers that are compared, from those `found` by `tracking_metrics`; `length` is that of the arm [m].
 
-    Returns ``peak_joint_error_rad``, ``peak_tip_mm``, ``rms_tip_mm`` (about the sag where there is gravity),
+    Returns ``peak_joint_error_rad``, ``peak_tip_mm``, ``rms_tip_mm`` (about the sag if there is gravity),
     ``residual_mm`` (from the motion's end on, over the case's window), ``settling_s`` (None: not within the window),
     ``peak_torque_Nm`` (per joint), ``saturation_share`` and ``cost``.
     """

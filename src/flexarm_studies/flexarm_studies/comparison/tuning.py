@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning by simulation: the same search, metric and number of simulations for every controller.
+"""Tunes by simulation, with the same search, metric and number of simulations for every controller.
 
-A third of the budget goes to the first guess and a Latin hypercube, the rest to Nelder and Mead's simplex from the
-best of those; when that has converged, once more from the next best. The seed decides everything.
+A third of the budget goes to the first guess and a Latin hypercube. The rest goes to Nelder and Mead's simplex, from
+the best of these; when it has converged, again from the next best. The seed determines everything.
 
-A controller that can be judged without simulation, by the poles of a linear loop, is screened first: only the best of
-a large hypercube are simulated. Without this most of a small budget would go to loops that can't be stable.
+A controller that can be judged without simulation, by the poles of a linear loop, is screened first: only the best
+points of a large hypercube are simulated. Without this, most of a small budget would go to loops that can't be stable.
 """
 
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
-#: Fraction of the budget that explores; edge of the first simplex and size at convergence, of the range [-].
+#: Fraction of the budget for exploration; edge of the first simplex and size at convergence, relative to the range [-].
 EXPLORING, EDGE, CLOSE = 1.0 / 3.0, 0.15, 1e-3
-#: How many places are screened without simulation.
+#: Number of places that are screened without simulation.
 SCREENED = 400
 
 
@@ -49,7 +49,7 @@ class Free:
 
     @property
     def place(self):
-        """The first guess's place, 0 to 1."""
+        """Place of the first guess, 0 to 1."""
         if self.log:
             return float(np.log(self.first / self.low) / np.log(self.high / self.low))
         return (self.first - self.low) / (self.high - self.low)

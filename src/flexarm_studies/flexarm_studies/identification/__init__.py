@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds an arm's parameters from how it moved: ``flexarm identify`` (docs/identification.md)."""
+"""Finds an arm's parameters from its recorded motion: ``flexarm identify`` (docs/identification.md)."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What to measure next, from the covariance of a fit: what makes most of the other intervals narrower.
+r"""Suggests what to measure next, from the covariance of a fit: what narrows most of the other intervals.
 
 Once a parameter j is known, the variance of i is :math:`P_{ii} - P_{ij}^2/P_{jj}`: its interval becomes narrower by
 :math:`\sqrt{1 - \rho_{ij}^2}` with the correlation :math:`\rho`. Parameters that the motion determines badly, and those
@@ -10,7 +10,7 @@ import numpy as np
 
 #: An interval becomes narrower by at least this factor, or it is not mentioned.
 NARROWER = 0.7
-#: Suggestions, and names in each, at most.
+#: Max. number of suggestions, and of names in each.
 MAX_SUGGESTIONS, MAX_NAMES = 6, 4
 #: A correlation as large as this is mentioned.
 STRONG = 0.9
@@ -58,7 +58,7 @@ def strongest(found, count=8):
     ----------
     found : Identified or StrainFit
     count : int
-        Pairs at most.
+        Max. number of pairs.
     """
     fitted, rho = correlations(found)
     rows, columns = np.triu_indices(len(fitted), 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes an arm file with identified values: the text of the given file with its comments, numbers replaced."""
+"""Writes an arm file with identified values: replaces numbers in the text of the given file, keeps its comments."""
 
 import io
 
@@ -16,7 +16,7 @@ from .quantities import KEY, damping_of
 
 #: Significant digits of the written values, and the relative error allowed when they are read back [-].
 DIGITS, TOLERANCE = 8, 1e-6
-#: Kind of a `Quantity`: the angle by which a joint's zero is off; it turns the joint's origin.
+#: Kind of a `Quantity`: the error of a joint's zero angle; it turns the joint's origin.
 OFFSET = "offset"
 #: A gauge or a section stays on one line, however long.
 WIDTH = 4096
@@ -27,10 +27,10 @@ class _Number(str):
 
 
 def rewritten(text, identified, heading=(), notes=None):
-    """The `text` of the arm file that the fit started from with the `identified` values, below a comment, `heading`.
+    """The `text` of the arm file from which the fit started, with the `identified` values, below a comment, `heading`.
 
-    `notes`, by names of quantities, stand behind their numbers where the file gives these a line of their own.
-    Refused when the new text does not read as the identified arm.
+    `notes`, by names of quantities, are written behind their numbers if these have a line of their own. The new text is
+    refused if it does not give the identified arm when it is read.
     """
     try:
         made = _edited(text, identified, notes or {})
@@ -136,7 +136,7 @@ def _change(arm, q):
 
 
 def _inertia(arm):
-    """The payload's inertia: one number if it is the same about all axes, else xx, yy, zz, xy, xz, yz."""
+    """The payload's inertia: one number if it is the same about all axes, otherwise xx, yy, zz, xy, xz, yz."""
     i = np.array(arm.payload.inertia)
     if np.allclose(i, i[0, 0] * np.eye(3)):
         return i[0, 0]
@@ -172,7 +172,7 @@ def _put(data, path, value):
 
 
 def _note(data, path, words):
-    """Write a comment behind an entry, in the place of one that is there; not in a mapping on one line."""
+    """Write a comment behind an entry, in place of an existing one; not in a mapping on one line."""
     for key in path[:-1]:
         if isinstance(data, CommentedMap) and data.fa.flow_style():
             return
@@ -182,7 +182,7 @@ def _note(data, path, words):
 
 
 def _add(data, key, value):
-    # Not at the end: the comment before the file's next part hangs there.
+    # Not at the end: the comment before the file's next part is attached there.
     data.pop(key, None)
     data.insert(min(1, len(data)), key, value)
 

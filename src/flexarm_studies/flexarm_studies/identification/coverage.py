@@ -28,7 +28,7 @@ from .recording import Recording
 SPREAD = 0.3
 #: Rms noise of the gauges [strain], and counts of the encoder.
 NOISE, COUNTS = 0.5e-6, 4096
-#: The excitation: a sweep over both modes, then no torque.
+#: The excitation: a sweep over both modes, then a time without torque.
 SETTINGS = {"kind": "sweep", "amplitude": 6.0, "duration": 4.0, "rest": 2.0}
 SETTINGS |= {"frequency_low": 0.3, "frequency_high": 20.0}
 
@@ -63,7 +63,7 @@ def _still(arm):
 
 
 def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
-    """A `Recording` of a simulated arm's encoder and gauges during the excitation with these `settings`.
+    """A `Recording` of a simulated arm's encoder and gauges during an excitation with these `settings`.
 
     The excitation is planned for `drive`, an arm; for the arm itself if none is given.
     """
@@ -85,10 +85,10 @@ def measured(arm, settings=SETTINGS, rate=250.0, seed=0, drive=None):
 
 
 def run(arms, seed=0, rate=250.0, settings=SETTINGS, progress=None):
-    """Identify so many `arms`, excited with these `settings`; a row per parameter and derived value.
+    """Identify this number of `arms`, excited with these `settings`; return a row per parameter and derived value.
 
-    A row has how many intervals covered the truth, the relative widths, the errors in half-widths, and how often it was
-    left out.
+    A row has the number of intervals that covered the truth, the relative widths, the errors in half-widths, and how
+    often the parameter was left out.
     """
     given, table = nominal(), {}
     for k in range(arms):

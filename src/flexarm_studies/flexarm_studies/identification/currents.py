@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Motor currents beside the torque that the motion takes: torque constant and friction of each joint.
+r"""Compares motor currents with the torque of the motion, for torque constant and friction of each joint.
 
-With the torque :math:`\tau` of the model whose joints move as recorded,
+With the torque :math:`\tau` of the model when its joints move as recorded,
 
 .. math::
     K\,I = \tau + J\ddot q + f_v\dot q + f_c\tanh(\dot q/v_0) + b,
 
-linear in 1/K, J/K, f_v/K, f_c/K and b/K: a regression on the fitted part. K is the torque per ampere at the joint,
-in the scale of masses that the arm file has; J is what the rotor's inertia in the file lacks. How much
-of the current is left is the normalised residual sum of squares :math:`\sum(I - \hat I)^2/\sum(I - \bar I)^2`; 0:
-nothing.
+This is linear in 1/K, J/K, f_v/K, f_c/K and b/K: a regression on the fitted part finds them. K is the torque per ampere
+at the joint, in the scale of the arm file's masses. J is what must be added to the rotor's inertia in the file. The
+unexplained fraction of the current is the normalised residual sum of squares :math:`\sum(I - \hat I)^2/\sum(I - \bar
+I)^2`; 0: nothing.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,13 @@ from ..recordings.trends import regression
 from .fit import bandwidth
 from .prescribed import MotionPredictor, prescribed_torque
 
-#: A joint is explained if no more than this is left of its current [-].
+#: A joint is explained if the unexplained fraction of its current is at most this [-].
 EXPLAINED = 0.5
 
 
 @dataclass(frozen=True)
 class MotorFit:
-    """Current of one joint's motor, explained.
+    """How the model explains the current of one joint's motor.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ def motor_fits(found, run, fitted, scored, corner, other=None):
 
 
 def _regressors(found, run, corner):
-    """Of the current of each joint: torque, acceleration, speed, direction, one; shape (s, 5) each."""
+    """Regressors of each joint's current: torque, acceleration, speed, direction, one; shape (s, 5) each."""
     arm = found.setup.arm
     torque, predictor = torques(arm, run, corner, found.setup.offset)
     made = []
@@ -124,13 +124,13 @@ def _regressors(found, run, corner):
 
 
 def _left(current, predicted):
-    """Fraction of the current's sum of squares, about its mean, that a prediction leaves."""
+    """Fraction of the current's sum of squares, about its mean, that a prediction does not explain."""
     whole = np.sum((current - current.mean()) ** 2)
     return float(np.sum((current - predicted) ** 2) / max(whole, 1e-300))
 
 
 def _regressed(X, y):
-    """As `regression`, with as many lags as the residuals' correlation from one sample to the next asks for."""
+    """As `regression`, with as many lags as the correlation of the residuals between successive samples requires."""
     left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
     return regression(X, y, min(bandwidth(left[:, None]), len(y) // 4))
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Values that follow from an arm file: frequencies, damping and coupling of its modes.
+r"""Computes values that follow from an arm file: frequencies, damping and coupling of its modes.
 
-For the straight arm at rest in one configuration, with joints locked and free. The coupling of joint j with the locked
-mode i is :math:`\gamma_{ji} = (M_{12}\Psi)_{ji}` with the mode's shape :math:`\Psi_i` of unit modal mass: its
-square is the part of the inertia about joint j that belongs to mode i. Free modes are those of (2) with structural
+They are for the straight arm at rest in one configuration, with joints locked and free. The coupling of joint j with
+the locked mode i is :math:`\gamma_{ji} = (M_{12}\Psi)_{ji}` with the mode's shape :math:`\Psi_i` of unit modal mass:
+its square is the part of the inertia about joint j that mode i contributes. Free modes are those of (2) with structural
 damping and the joints' viscous friction. Intervals come from the parameters' covariance by the delta method.
 """
 

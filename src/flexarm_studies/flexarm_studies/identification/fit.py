@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Output-error fit of an arm's parameters, with intervals that are valid for coloured residuals.
+r"""Fits an arm's parameters (output-error method), with intervals that are valid for coloured residuals.
 
-Parameters :math:`\theta`, gauge biases and initial state x_0 are those whose prediction (`predictor`) is nearest to the
+Parameters :math:`\theta`, gauge biases and initial state x_0 are those whose prediction (`predictor`) is closest to the
 measurement,
 
 .. math:: \min_{\theta, x_0} \sum_k\sum_c w_{kc}\,(y_{kc} - \hat y_{kc})^2/\sigma_c^2 ,
 
-with :math:`\sigma_c` of each channel from its residuals. An encoder that stays on one count for r samples has made one
-measurement, not r: its samples have the weight :math:`w = 1/r`. (Ljung, System Identification, 1999, 7.2 and 9.)
+where :math:`\sigma_c` of each channel follows from its residuals. An encoder that stays on one count for r samples has
+made one measurement, not r: its samples have the weight :math:`w = 1/r`. (Ljung, System Identification, 1999, 7.2 and
+9.)
 
-A frequency with a relative error s is out of step after 1/(2 s) periods, and from there on the sum has other minima:
-the fit begins with the first periods of the motion and continues with longer and longer parts of it.
+A vibration whose frequency has a relative error s is in opposite phase after 1/(2 s) periods, and from then on the sum
+has other minima. So the fit begins with the first periods of the motion and continues with longer and longer parts of
+it.
 
 The covariance, for scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, is
 
@@ -20,8 +22,8 @@ The covariance, for scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, is
 (Newey and West 1987; L by Andrews 1991 from the most coloured channel). For white residuals this is the usual
 :math:`\sigma^2 (J^TJ)^{-1}`; the larger of the two variances is used. Intervals are :math:`\pm 1.96\sqrt{P_{ii}}`.
 
-A parameter that the motion does not determine keeps the file's value: one whose interval is wider than a fraction of
-its value, the worst one first; then the others are fitted again.
+A parameter that the motion does not determine keeps the file's value. Such a parameter has an interval wider than a
+fraction of its value. The worst one is taken first; then the others are fitted again.
 """
 
 from dataclasses import dataclass, field
@@ -38,7 +40,7 @@ from .quantities import changed, held, quantities
 NORMAL = 1.959964
 #: Difference step of the Jacobian, as a fraction of a quantity's scale [-].
 STEP = 1e-7
-#: The first part of the motion that is fitted, in periods of the slowest mode, and the factor to each next part.
+#: First part of the motion that is fitted, in periods of the slowest mode, and factor from each part to the next.
 FIRST_PERIODS, GROWTH = 1.0, 2.0
 #: Standard deviation of the prior around the file's value in these parts, as a fraction of the scale [-].
 PRIOR = 0.5
@@ -46,7 +48,7 @@ PRIOR = 0.5
 MAX_SCALED = 30.0
 #: Smallest noise that a channel is assumed to have [rad], [strain].
 MIN_NOISE = 1e-9
-#: Noise assumed before any fit where none is stated, as a fraction of the signal [-].
+#: Noise assumed before any fit if none is stated, as a fraction of the signal [-].
 ASSUMED = 1e-3
 #: Smallest bandwidth of the covariance, in multiples of the third root of the number of samples [-].
 LAG_FACTOR = 1.0
@@ -54,7 +56,7 @@ LAG_FACTOR = 1.0
 MAX_CORRELATION = 0.97
 #: The model does not explain the motion if a channel's residual exceeds this fraction of the signal's deviation [-].
 POOR = 0.05
-#: Stiffnesses that are tried after a poor first fit, as factors of the file's [-].
+#: Stiffnesses that are tried after a poor first fit, as factors of the file's stiffnesses [-].
 TRIED = (0.4, 0.6, 1.6, 2.5)
 #: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
 SINGULAR = 1e-5
@@ -71,13 +73,13 @@ class Identified:
     Attributes
     ----------
     arm : Arm
-        With the fitted values; the file's where a quantity is held or undetermined.
+        With the fitted values, or the file's value if a quantity is held or undetermined.
     quantities : list of Quantity
         Of the arm, fitted or not.
     values, half_widths : ndarray, shape (p,)
         Values, and half-widths of the 95 % intervals, NaN where the file's value was kept [SI].
     covariance : ndarray, shape (p, p)
-        Of the values; zero where they are held.
+        Covariance of the values; zero where they are held.
     initial : ndarray, shape (2 (n + m),)
         Initial state.
     predicted : ndarray, shape (s, n + g)
@@ -120,7 +122,7 @@ def identify(arm, recording, hold=(), limit=0.5):
     Raises
     ------
     FlexarmError
-        For a pattern that matches nothing, and where the model can't follow the motion at all.
+        For a pattern that matches nothing, and if the model can't follow the motion at all.
     """
     problem = Problem(arm, recording, hold)
     problem.leave_out_singular()
@@ -152,7 +154,7 @@ class Problem:
     # Scales ----------------------------------------------------------------------------------
 
     def _weights(self):
-        """Square roots of w, shape (s, n + g): a run on one count weighs as one sample, a missing value nothing."""
+        """Square roots of w, shape (s, n + g): a run on one count weighs as one sample, a missing value zero."""
         weight = np.isfinite(self.measured).astype(float)
         for c in range(self.predictor.n):
             reading = self.measured[:, c]
@@ -199,7 +201,7 @@ class Problem:
         return np.concatenate([self.values[self.free], self.initial]) / self._scales
 
     def residuals(self, x, samples):
-        """Weighted residuals (measured less predicted), shape (samples, n + g)."""
+        """Weighted residuals (measured minus predicted), shape (samples, n + g)."""
         values, initial = self._point(x)
         arm = changed(self.arm, self.found, values)
         predicted = self.predictor.predict(arm, initial, samples)
@@ -218,7 +220,7 @@ class Problem:
             other = values.copy()
             other[index] += STEP * self.found[index].scale
             other = changed(self.arm, self.found, other)
-            # Gains and biases don't affect the motion: the states are the same.
+            # Gains and biases do not affect the motion: the states are the same.
             same = self.found[index].kind in ("gain", "bias")
             made = (states, built) if same else self.predictor.states(other, initial, samples)
             out[:, :, j] = (self.predictor.outputs(other, *made) - base) / STEP
@@ -251,7 +253,7 @@ class Problem:
             )
 
     def _kept(self):
-        """The current point, and its cost under the noise assumed before any fit, which compares between fits."""
+        """The current point, and its cost with the noise assumed before any fit, which makes fits comparable."""
         noise, self.noise = self.noise, self._prior_noise()
         cost = float(np.sum(self.residuals(self._unknowns(), len(self.measured)) ** 2))
         self.noise = noise
@@ -289,7 +291,7 @@ class Problem:
         return ends
 
     def _solve(self, samples, prior, tolerance, most):
-        """Least squares from the current point; with `prior`, weakly held to the file's values."""
+        """Least squares from the current point; with `prior`, weakly bound to the file's values."""
         start, p = self._unknowns(), int(self.free.sum())
         scales = self._scales[:p]
         file = self.file[self.free] / scales
@@ -330,7 +332,7 @@ class Problem:
     # What is determined ----------------------------------------------------------------------
 
     def covariance(self):
-        """Of the free quantities and the initial state, scaled; see the module."""
+        """Covariance of the free quantities and the initial state, scaled; see the module."""
         whole, x = len(self.measured), self._unknowns()
         J, r = self.jacobian(x, whole), self.residuals(x, whole)
         return robust_covariance(J, r, np.count_nonzero(self.weight))
@@ -359,7 +361,7 @@ class Problem:
         return int(indices[worst])
 
     def leave_out_singular(self):
-        """Leave out quantities that don't affect the measurements, or only in the same way as others."""
+        """Leave out quantities that do not affect the measurements, or only in the same way as others."""
         while self.free.any():
             J = self.jacobian(self._unknowns(), len(self.measured))
             J = J.reshape(-1, J.shape[-1])
@@ -376,7 +378,7 @@ class Problem:
             if values[-1] > SINGULAR * values[0] or not involved.size:
                 return
             names = [self.found[indices[k]].name for k in involved]
-            # The one with the smallest effect keeps the file's value.
+            # The quantity with the smallest effect keeps the file's value.
             least = int(involved[np.argmin(size[involved])])
             self._because = f"{', '.join(names)} act alike on what was measured"
             self.leave_out(int(indices[least]))

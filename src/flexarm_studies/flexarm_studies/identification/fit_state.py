@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fit has found so far, in a file, so that one that was interrupted goes on."""
+"""Keeps what a fit has found so far in a file, so an interrupted fit can go on."""
 
 import hashlib
 import json
@@ -19,14 +19,14 @@ class FitState:
     path : str or Path
         Created if missing.
     key : str
-        Of arm, recording and options, see `key_of`.
+        Hash of arm, recording and options, see `key_of`.
 
     Attributes
     ----------
     starts : dict
         Number of a start to its sum of squares and its values.
     best : dict or None
-        Where the fit is after the starts, as `StrainProblem.snapshot`.
+        State of the fit after the starts, as `StrainProblem.snapshot`.
 
     Raises
     ------
@@ -55,7 +55,7 @@ class FitState:
             )  # fmt: skip
 
     def keep_start(self, number, cost, values):
-        """Keep what start `number` ended with: sum of squares `cost` and `values` (p,)."""
+        """Keep the result of start `number`: sum of squares `cost` and `values` (p,)."""
         self.starts[number] = float(cost), [float(v) for v in values]
         self._write()
 
@@ -72,7 +72,7 @@ class FitState:
 
 
 def key_of(arm, recording, options):
-    """A hash of the `arm`, of what of the `recording` is fitted, and of the `options`."""
+    """A hash of the `arm`, of the fitted part of the `recording`, and of the `options`."""
     made = hashlib.sha256(repr(arm).encode())
     for values in (recording.position, recording.strain):
         made.update(np.ascontiguousarray(values).tobytes())

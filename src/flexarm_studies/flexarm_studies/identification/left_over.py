@@ -2,9 +2,10 @@
 """What could still be explained of the strains that a model leaves: by the joints' motion, by currents, by gauges.
 
 ``python -m flexarm_studies.identification.left_over exp1.csv tudor --mapping tudor --gauge eps31 --fit 14:60 --score
-60:80 --band 8:21`` fits what belongs to the recording, the arm being held, and regresses what is left of a gauge, in a
-band of frequencies, on sets of signals at many lags (`ridge`): as large a linear model as the fitted part bears. Where
-even this explains nothing, no model of that input does that is linear, or linear for each side of the gears' play.
+60:80 --band 8:21`` fits what belongs to the recording, while the arm is held. It regresses the residual of a gauge, in
+a band of frequencies, on sets of signals at many lags (`ridge`). This linear model is as large as the fitted part
+allows. If even this explains nothing, no model of that input does that is linear, or linear for each side of the gears'
+play.
 """
 
 import argparse
@@ -27,12 +28,12 @@ from .strain_study import Study, study
 
 #: The arm's numbers, as patterns of `Options.hold`.
 HOLD = ("joints*", "links*", "payload*", "gauges*gain", "gauges*position", "* offset")
-#: Past and future that the regressions use [s], and of the other gauges.
+#: Past and future that the regressions use [s], and the same for the other gauges.
 PAST, FUTURE, NEAR = 0.6, 0.2, 0.1
 
 
 def signals(run, predicted, motion, gauge):
-    """Sets of signals: name to columns (s, c), seconds to come and seconds past.
+    """Sets of signals: name to columns (s, c), seconds of the future and seconds of the past.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ def signals(run, predicted, motion, gauge):
     motion : tuple of ndarray, shape (s, n)
         Position, velocity, acceleration of the joints.
     gauge : int
-        Which is explained.
+        Index of the explained gauge.
     """
     static, rigid = scores.regressors(*motion)
     inertial = rigid[:, static.shape[1] :]
@@ -62,13 +63,13 @@ def signals(run, predicted, motion, gauge):
 
 
 def explained(columns, error, period, fitted, scored, band, lags):
-    """What a set of signals explains of residuals in a band.
+    """How much a set of signals explains of the residuals in a band.
 
     Parameters
     ----------
     columns : ndarray, shape (s, c)
     error : ndarray, shape (s,)
-        Measured less predicted strain [-].
+        Measured minus predicted strain [-].
     period : float
         [s]
     fitted, scored : slice
@@ -76,13 +77,13 @@ def explained(columns, error, period, fitted, scored, band, lags):
     band : tuple of float
         [Hz]
     lags : tuple of float
-        Seconds to come, and seconds past.
+        Seconds of the future, and seconds of the past.
 
     Returns
     -------
     blocks, later : float
-        Fraction of the sum of squares that is explained in blocks of the fitted part that the regression was not
-        fitted to, and in the scored part [-].
+        Explained fraction of the sum of squares in blocks of the fitted part to which the regression was not fitted,
+        and in the scored part [-].
     coefficients : int
     """
     passes = butter(scores.ORDER, band, "bandpass", fs=1.0 / period, output="sos")

@@ -2,9 +2,9 @@
 """How far predicted strains are off a sample ahead: the observer without torque beside what needs no model.
 
 ``python -m flexarm_studies.identification.one_step exp1.csv rough.yaml --mapping tudor --observer observer.yaml --fit
-14:60 --score 60:80`` prints the rms errors of a part of a recording. What is fitted, an autoregression and the
-observer's memory of its innovations, is fitted on another part and kept from then on. Persistence takes the last
-reading for the next one; the autoregressions are of all gauges on all gauges.
+14:60 --score 60:80`` prints the rms errors of a part of a recording. An autoregression and the observer's memory of its
+innovations are fitted on another part, and kept from then on. Persistence takes the last reading as the prediction of
+the next one. The autoregressions are of all gauges on all gauges.
 """
 
 import argparse
@@ -24,15 +24,15 @@ from ..loop import parameter_files
 from ..recordings import mapping as mappings
 from . import recording as recordings
 
-#: Past samples of the autoregression that the observer is held against.
+#: Past samples of the autoregression with which the observer is compared.
 ORDER = 8
-#: The observer that is run, and its parameters' prefix.
+#: The observer that is run, and the prefix of its parameters.
 OBSERVER, PREFIX = "motion_kalman", "observer."
 MICRO = 1e6
 
 
 def filter_errors(arm, parameters, run, learnt):
-    """Measured less predicted strain of each sample, by the filter alone and with its memory, shape (s, g) each.
+    """Measured minus predicted strain of each sample, by the filter alone and with its memory, shape (s, g) each.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def filter_errors(arm, parameters, run, learnt):
 
 
 def regression_errors(strain, fitted, order):
-    """The same of an autoregression of this `order` on all gauges (s, g), fitted to the first so many samples."""
+    """As `filter_errors`, by an autoregression of `order` of `strain` (s, g), fitted to the first `fitted` samples."""
     count = len(strain) - order
     past = [strain[order - 1 - k : order - 1 - k + count] for k in range(order)]
     past = np.hstack([*past, np.ones((count, 1))])
@@ -71,7 +71,7 @@ def regression_errors(strain, fitted, order):
 
 
 def compare(arm, parameters, run, fitted, order=ORDER):
-    """Errors of each way to predict after the first so many samples: name to rms, shape (g,) [-].
+    """Errors of each way to predict after the first `fitted` samples: name to rms, shape (g,) [-].
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def compare(arm, parameters, run, fitted, order=ORDER):
     parameters : dict
         Of the observer, without its type.
     run : Recording
-        From the beginning of the fitted part to the end of the scored one, which follow each other.
+        From the beginning of the fitted part to the end of the scored part, which follows it.
     fitted : int
         Samples of the fitted part.
     order : int

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What the bridges of the gauges pick up from the motors: noise that all gauges share, and that the currents show.
+r"""Finds what the bridges of gauges pick up from the motors: noise that all gauges share and that the currents show.
 
-Beside the strain of its link every gauge c reads the same filter of the motor currents I,
+In addition to the strain of its link, every gauge c reads the motor currents I through the same filter,
 
 .. math::
     e_c(k) = \sum_j \sum_{l=0}^{L} h_{jl}\,I_j(k - l) + r_c(k),
 
-e being measured less predicted strain. Both sides are high-passed without phase: below that frequency the currents
-follow the motion, and a regression on them would hide what the model lacks. That h is one filter for all gauges makes
-it noise: a vibration reads differently on each. The sum of :math:`(r_c/\sigma_c)^2` is least where h is fitted to the
-mean of the gauges with the weights :math:`1/\sigma_c^2`, by ridge regression (`ridge`). The filter counts only if it
-explains blocks of the fitted part that it was not fitted to.
+where e is measured minus predicted strain. Both sides are high-passed without phase: below that frequency the currents
+follow the motion, and a regression on them would hide what the model lacks. Because h is one filter for all gauges, it
+is noise: a vibration reads differently on each gauge. The sum of :math:`(r_c/\sigma_c)^2` is smallest if h is fitted to
+the mean of the gauges with the weights :math:`1/\sigma_c^2`, by ridge regression (`ridge`). The filter is used only if
+it explains blocks of the fitted part to which it was not fitted.
 """
 
 from dataclasses import dataclass
@@ -22,9 +22,9 @@ from flexarm_dynamics.errors import FlexarmError
 from . import ridge
 from .scores import filled, high_passed
 
-#: Past that counts [s].
+#: Length of the past that is used [s].
 PAST = 0.2
-#: The filter counts if it leaves less than this of the sum of squares of blocks that it was not fitted to [-].
+#: The filter is used if it leaves less than this of the sum of squares of blocks to which it was not fitted [-].
 USEFUL = 0.99
 #: Smallest mean square.
 LEAST = 1e-300
@@ -37,13 +37,13 @@ class Pickup:
     Attributes
     ----------
     taps : ndarray, shape (L + 1, c)
-        Strain per ampere of the current of each joint so many samples ago [1/A].
+        Strain per ampere of the current of each joint, by the number of samples ago [1/A].
     joints : tuple of int
-        Whose current was recorded.
+        Joints whose current was recorded.
     above : float
         Corner of the high pass [Hz].
     left : float
-        Of the sum of squares above that frequency, in blocks that the filter was not fitted to [-].
+        Remaining fraction of the sum of squares above that frequency, in blocks to which the filter was not fitted [-].
     """
 
     taps: np.ndarray
@@ -53,7 +53,7 @@ class Pickup:
 
     @property
     def useful(self):
-        """Whether it explains samples that it was not fitted to."""
+        """Whether it explains samples to which it was not fitted."""
         return self.left < USEFUL
 
     def strain(self, run):
@@ -69,9 +69,9 @@ def fit(run, error, fitted, above):
     run : Recording
         With motor currents.
     error : ndarray, shape (s, g)
-        Measured less predicted strains, NaN where they were not measured [-].
+        Measured minus predicted strains, NaN where they were not measured [-].
     fitted : slice
-        Samples that count.
+        Samples that are used.
     above : float
         Corner of the high pass [Hz].
 
@@ -97,5 +97,5 @@ def fit(run, error, fitted, above):
 
 
 def _past(run, joints, above, size):
-    """High-passed currents of this sample and the ones before, shape (s, size c) [A]."""
+    """High-passed currents of this sample and of earlier ones, shape (s, size c) [A]."""
     return ridge.lagged(high_passed(run.current[:, joints], run.period, above), 0, size - 1)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Predicts measurements: the arm's own model under the recorded torque, from an initial state.
+r"""Predicts measurements with the arm's own model under the recorded torque, from an initial state.
 
 .. math::
     \dot x = f(x, u_k; \theta), \qquad
     \hat y_k = \begin{bmatrix} q(t_k)\\ g\,R\,\delta(t_k) + b\end{bmatrix}
 
 with the full equations of motion (2) and the torque :math:`u_k` constant over the interval that ends at
-:math:`t_k`, integrated by the compiled stepper. Nothing is linearised: friction and products of deflections count.
-The initial state x_0 is unknown and estimated with the parameters.
+:math:`t_k`, integrated by the compiled stepper. Nothing is linearised: friction and products of deflections are
+included. The initial state x_0 is unknown and estimated with the parameters.
 """
 
 import numpy as np
@@ -22,7 +22,8 @@ from flexarm_sim import integrators
 METHOD = "dop853"
 #: The fitted highest mode may be this much faster than the file's [-].
 MARGIN = 1.3
-#: Steps are longer than the simulator's by this factor: the error stays below a thousandth of a microstrain (tested).
+#: Steps are longer than those of the simulator by this factor: the error stays below a thousandth of a microstrain
+#: (tested).
 LONGER = 2.0
 #: Largest product of friction's rate and step: the method is stable up to about 6 [-].
 STABLE = 3.0
@@ -31,7 +32,7 @@ STABLE = 3.0
 class Predictor:
     """Predicts the measurements of a `recording` for arms with the same structure.
 
-    `arm` is the file's, which fixes the number of integration steps.
+    `arm` is that of the file; it determines the number of integration steps.
     """
 
     def __init__(self, arm, recording):
@@ -41,13 +42,13 @@ class Predictor:
         bending = integrators.substeps(first, MARGIN / LONGER * recording.period, METHOD)
         friction = int(np.ceil(_friction_rate(first, recording) * recording.period / STABLE))
         self.substeps = max(bending, min(friction, integrators.MAX_SUBSTEPS))
-        # Row k of a recording has the torque that brought the arm there.
+        # Row k of a recording has the torque that moved the arm to row k.
         self.torque = np.ascontiguousarray(recording.torque[1:])
 
     def states(self, arm, initial, samples=None):
-        """States at so many `samples`, or at all, shape (s, 2 (n + m)), from the `initial` one, and the model.
+        """States at the first `samples`, or at all, shape (s, 2 (n + m)), from the `initial` one; and the model.
 
-        NaN where the model diverges; None in place of a model where the arm can have none.
+        NaN where the model diverges; None in place of a model if the arm can have none.
         """
         try:
             built = model.build(arm)
@@ -106,11 +107,11 @@ def _friction_rate(built, recording):
     """Largest rate at which friction alone may stop a joint [1/s], for twice the file's friction.
 
     At low speed Coulomb friction acts as viscous friction, coulomb / smoothing. On a joint that turns little mass this
-    is fast compared with the bending, and steps that are too long for it turn the prediction into noise.
+    is fast compared with the bending. Steps that are too long for it turn the prediction into noise.
     """
     n = built.n_joints
     viscous, coulomb, smoothing = built.friction_table().T
-    # Where the file states none: what would have an effect in this motion.
+    # If the file states none: a friction that would have an effect in this motion.
     coulomb = np.maximum(coulomb, 0.02 * np.abs(recording.torque).max(axis=0))
     give = np.diag(built.terms(recording.position[0], np.zeros(n)).H)[:n]
     return 2.0 * float(np.max(give * (viscous + coulomb / smoothing)))

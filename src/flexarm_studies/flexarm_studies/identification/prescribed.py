@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Predicts strains without torque: the joints' motors move as they were measured, the links follow.
+r"""Predicts strains without torque: the joints' motors move as measured, and the links follow.
 
-With the joint motion prescribed, the rows of the links and transmissions are all that is left of (2),
+With the joint motion prescribed, only the rows of the links and transmissions are left of (2),
 
 .. math::
     M_{22}(q, \delta)\,\ddot\delta + M_{21}(q, \delta)\,\ddot q + f_2 + K_2\delta + C_2\dot\delta = 0, \qquad
     \hat\varepsilon_c(t) = g_c R_c\,\delta(t - \tau_c) + b_c + d_c\,(t - t_m),
 
-so that no torque, motor inertia or friction counts. The measured angles pass a low pass without phase and become a
-cubic spline: its acceleration is linear between samples, as the compiled stepper takes it, and position, velocity and
-acceleration are of one motion. The links start at rest under gravity.
+so torque, motor inertia and friction have no effect. The measured angles pass a low pass without phase and become a
+cubic spline. Its acceleration is linear between samples, as the compiled stepper needs it, and position, velocity and
+acceleration belong to one motion. The links start at rest under gravity.
 
-Gauge c reads with gain g, bias b, drift d about the middle t_m of the recording, and late by tau (early if negative);
-between samples :math:`\delta` is the Hermite cubic of amplitudes and rates.
+Gauge c has gain g, bias b, drift d about the middle t_m of the recording, and is late by tau (early if negative).
+Between samples, :math:`\delta` is the Hermite cubic of amplitudes and rates.
 """
 
 import numpy as np
@@ -26,15 +26,16 @@ from flexarm_dynamics.models.chain import Chain
 
 from ..recordings.motion import CORNER, low_passed
 
-#: The linearly implicit method is stable however stiff and strongly damped a transmission is that the fit tries.
+#: The linearly implicit method is stable for any stiffness and damping of a transmission that the fit tries.
 METHOD = "implicit"
-#: Largest phase a step [rad] of a mode that the samples show, up to `SHOWN` periods of it a sample [-]: a strain is off
-#: by less than a tenth of a microstrain on arms like TUDOR (tested).
+#: Largest phase per step [rad] of a mode that the samples show, that is, up to `SHOWN` periods per sample [-]: the
+#: error of a strain is below a tenth of a microstrain on arms like TUDOR (tested).
 PHASE, SHOWN = 0.06, 0.2
-#: Where flanks meet, a step is at most the way over which they do at this speed [rad/s]: with sharp flanks a strain is
-#: then off by some hundredths of a microstrain rms (tested).
+#: Where flanks meet, a step is at most as long as they take to meet at this speed [rad/s]: with sharp flanks the error
+#: of a strain is then some hundredths of a microstrain rms (tested).
 FLANK_SPEED = 1.5
-#: Flanks that meet within less [rad] take no shorter steps: a fit may try any play, and so small a one does little.
+#: Flanks that meet within less than this [rad] take no shorter steps: a fit may try any play, and such a small one has
+#: little effect.
 MIN_FLANK = 1e-4
 #: Modes of arms that the fit tries may be this much faster than the file's [-].
 MARGIN = 1.4
@@ -46,7 +47,7 @@ class MotionPredictor:
     Parameters
     ----------
     arm : Arm
-        Of the structure of all arms whose strains will be predicted.
+        All arms whose strains will be predicted have its structure.
     recording : Recording
     corner : float
         Of the low pass of the joint angles [Hz].
@@ -75,7 +76,7 @@ class MotionPredictor:
         self.adapt(arm)
 
     def adapt(self, arm):
-        """Take the `substeps` that the motion needs of this `arm`, and of others that are `MARGIN` faster."""
+        """Set the `substeps` that the motion needs for this `arm`, and for others that are `MARGIN` faster."""
         frequencies = driven_frequencies(_chain(arm), self.position[0])
         fastest = MARGIN * float(np.max(frequencies, initial=0.0))
         rings = min(fastest, SHOWN * 2.0 * np.pi / self.period)
@@ -88,7 +89,7 @@ class MotionPredictor:
         self.substeps = max(1, int(np.ceil(rate * self.period)))
 
     def states(self, arm, offset=None, samples=None):
-        """Amplitudes and rates of the modes at so many `samples`, or all.
+        """Amplitudes and rates of the modes at the first `samples`, or at all.
 
         Parameters
         ----------
@@ -121,18 +122,18 @@ class MotionPredictor:
         return states[:, n : n + m], states[:, 2 * n + m :], built
 
     def strains(self, arm, delta, rate, built, delay=None, drift=None):
-        """What the gauges read, shape (s, g) [-].
+        """Readings of the gauges, shape (s, g) [-].
 
         Parameters
         ----------
         arm : Arm
-            Whose gauges read.
+            Its gauges are read.
         delta, rate, built
-            Of `states`.
+            Results of `states`.
         delay : ndarray, shape (g,), optional
-            By which the channels are late [s].
+            Time by which the channels are late [s].
         drift : ndarray, shape (g,), optional
-            Of the readings [1/s].
+            Drift of the readings [1/s].
         """
         gauges = arm.gauges
         out = np.full((len(delta), len(gauges)), np.nan)
@@ -173,7 +174,7 @@ def driven_frequencies(built, position, delta=None):
     position : ndarray, shape (n,)
         [rad]
     delta : ndarray, shape (m,), optional
-        Where the arm's stiffness is taken; straight if not given.
+        Deflections at which the arm's stiffness is taken; straight if not given.
     """
     from scipy.linalg import eigh
 
@@ -185,7 +186,7 @@ def driven_frequencies(built, position, delta=None):
 
 
 def prescribed_torque(chain, state, acceleration):
-    """Torque under which the joints have an acceleration, the modes moving freely, shape (n,) [N m].
+    """Torque under which the joints have an acceleration while the modes move freely, shape (n,) [N m].
 
     Parameters
     ----------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of an arm file that can be identified: path in the file, scale and smallest value of each."""
+"""Lists the numbers of an arm file that can be identified: path in the file, scale and smallest value of each."""
 
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
@@ -28,7 +28,7 @@ class Quantity:
     dimension : str
         As `flexarm_dynamics.arm.units` names it.
     scale : float
-        Size of its changes; an interval is compared with it where the value is near zero.
+        Size of its changes; an interval is compared with it if the value is near zero.
     low : float
         Smallest possible value.
     """
@@ -53,7 +53,7 @@ class Quantity:
 def quantities(arm, recording):
     """All quantities of an arm that can be identified, in the file's order.
 
-    The torques and speeds of the `recording` give friction a scale where the file has none.
+    The torques and speeds of the `recording` give friction a scale if the file has none.
     """
     found = []
     torque = np.abs(recording.torque).max(axis=0)
@@ -72,7 +72,7 @@ def quantities(arm, recording):
     for i, link in enumerate(arm.links):
         for direction, flexibility in link.flexible.items():
             at = f"links[{i}]"
-            if link.uniform:  # the file gives sections in the place of a stiffness
+            if link.uniform:  # the file gives sections in place of a stiffness
                 name = f"{at}.{KEY[direction]}"
                 found.append(quantity(arm, name, "EI", (i, direction), "N m^2", "stiffness", 1e-6))
             for k in range(flexibility.modes):
@@ -99,7 +99,7 @@ def quantity(arm, name, kind, where, unit, dimension, least, low=0.0):
 
 
 def held(found, patterns):
-    """Names of those of the quantities `found` that match one of the `patterns`; one that matches none is refused."""
+    """Names of the quantities `found` that match one of the `patterns`; a pattern that matches none is refused."""
     names = set()
     for pattern in patterns:
         # The brackets of a path are literal, not a character class.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded motion for identification: from a CSV file, or from the topics of a bag.
+"""Holds a recorded motion for identification, from a CSV file or from the topics of a bag.
 
-Row k of a recording holds the joint angles and strains at time k, and the torque that acted over the interval
-that ends there, as `ArmState` carries it. What else was measured stands beside them.
+Row k of a recording holds the joint angles and strains at time k, and the torque that acted over the interval that ends
+there, as in `ArmState`. Other measured signals are kept beside them.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from ..recordings import mapping as mappings
 
 #: Stamps may be off their grid by this fraction of the period [-].
 JITTER = 0.2
-#: A shorter recording is none of a motion.
+#: A shorter recording does not count as a motion.
 MIN_SAMPLES = 20
 #: `JointTorque.ENABLED`.
 ENABLED = 1
@@ -29,7 +29,7 @@ SIGNALS = (*OF_JOINTS, "strain", "amplitude", "linear_acceleration", "angular_ve
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A recorded motion, without gaps. Values that were not measured are NaN, or None where none of a kind was.
+    """A recorded motion, without gaps. Values that were not measured are NaN, or None if none of a kind were.
 
     Attributes
     ----------
@@ -38,11 +38,11 @@ class Recording:
     position : ndarray, shape (s, n)
         Joint angles [rad].
     torque : ndarray, shape (s, n)
-        Over the interval that ends at the sample; the first row is not used [N m].
+        Torque over the interval that ends at the sample; the first row is not used [N m].
     strain : ndarray, shape (s, g)
         In the order of the arm's gauges [-].
     notes : tuple of str
-        What was left out of it, and why.
+        What was left out of the recording, and why.
     velocity, acceleration, current : ndarray, shape (s, n), or None
         Of the joints [rad/s], [rad/s^2], [A].
     amplitude : ndarray, shape (s, m), or None
@@ -50,13 +50,13 @@ class Recording:
     linear_acceleration, angular_velocity : ndarray, shape (s, i), or None
         Of the axes of IMUs [m/s^2], [rad/s].
     joint_names, gauge_names, mode_names, imu_names : tuple of str
-        Of the columns; empty where only the arm has them.
+        Names of the columns; empty if only the arm has them.
     start : float
         Time of the first sample, as the source counts it [s].
     stamps : ndarray, shape (k,), or None
-        Times of all samples of the source, those that were left out too, as it counts them [s].
+        Times of all samples of the source, also of those that were left out, as it counts them [s].
     held : tuple of str
-        Joints that were not measured, since they stand still.
+        Joints that were not measured, because they stand still.
     """
 
     period: float
@@ -84,7 +84,7 @@ class Recording:
         return self.period * np.arange(len(self.position))
 
     def part(self, samples):
-        """Its first so many samples."""
+        """Its first `samples` samples."""
         return self._cut(slice(0, samples))
 
     def between(self, start, end):
@@ -124,7 +124,7 @@ class Recording:
 
 
 def kind_of(quantity):
-    """To what a quantity of `SIGNALS` belongs: joint, gauge, mode or imu."""
+    """What a quantity of `SIGNALS` belongs to: joint, gauge, mode or imu."""
     return mappings.QUANTITIES[quantity][0]
 
 
@@ -138,7 +138,7 @@ def uniform(time, signals, usable=None, **more):
     signals : dict
         Of `SIGNALS`, ``position`` and ``strain`` among them, to arrays with k rows.
     usable : ndarray of bool, shape (k,), optional
-        Samples whose torque says what moved the arm; None: all.
+        Samples whose torque is what moved the arm; None: all.
     more
         Further attributes of the `Recording`.
 
@@ -153,7 +153,7 @@ def uniform(time, signals, usable=None, **more):
     known = np.isfinite(signals["torque"]).all(axis=1)
     if known.any():
         signals["torque"] = np.nan_to_num(signals["torque"])
-    else:  # it is the motion that was recorded
+    else:  # the recorded signal is the motion itself
         known[:] = True
     usable = known if usable is None else known & usable
     steps = np.diff(time)
@@ -202,9 +202,9 @@ def read_csv(path, arm=None, mapping=None):
     ----------
     path : str or Path
     arm : Arm, optional
-        Whose joints, gauges and modes are wanted, in its order; all of the file, in its order, if not given.
+        Gives the wanted joints, gauges and modes, in its order; if not given, all in the file, in the file's order.
     mapping : Mapping, optional
-        What the columns are; the names in the first line if not given, see `recordings.mapping`.
+        Meaning of the columns; if not given, the names in the first line are used, see `recordings.mapping`.
 
     Returns
     -------
@@ -250,7 +250,7 @@ def read_csv(path, arm=None, mapping=None):
 
 
 def _has_header(first, mapping):
-    """Whether the first row has names: as the mapping says, else if a cell is no number."""
+    """Whether the first row has names: by the mapping, otherwise if a cell is not a number."""
     if mapping is None:
         return True
     if mapping.header is not None:
@@ -267,7 +267,7 @@ def _is_number(word):
 
 
 def _named_columns(path, header, arm):
-    """The mapping that the names in the first line make; one that misses what is wanted is refused."""
+    """The mapping from the names in the first line; it is refused if something wanted is missing."""
     made = mappings.by_names(header, arm)
     joints = arm.joint_names if arm is not None else made.names("joint")
     wanted = ["t", *(f"{joint}_position" for joint in joints)]
@@ -282,7 +282,7 @@ def _named_columns(path, header, arm):
 
 
 def _names(mapping, arm):
-    """Names of what was measured, in the arm's order, or in the file's without one; foreign ones are refused."""
+    """Names of what was measured, in the arm's order, or the file's without an arm; unknown ones are refused."""
     names = {kind: mapping.names(kind) for kind in mappings.KINDS}
     if arm is None:
         return names
@@ -339,12 +339,12 @@ def _check_ascending(path, lines, time):
 
 
 def from_tables(states, torques, arm):
-    """A recording from the tables of `arm_state` and, where there is one, of the `joint_torque` that answered it.
+    """A recording from the tables of `arm_state` and, if there is one, of the `joint_torque` that answered it.
 
-    With torques, only those samples count over which an enabled torque acted: the safe action before and after
-    moves the arm in ways that no torque tells of. The tables `states` and `torques` are those of a bag's `Contents`:
-    arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once. Of the `arm` only
-    its ``joint_names``, ``gauge_names`` and ``mode_names`` are used.
+    With torques, only samples are used over which an enabled torque acted: the safe action before and after moves the
+    arm in ways that no recorded torque shows. The tables `states` and `torques` are those of a bag's `Contents`: arrays
+    ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once. Of the `arm` only its
+    ``joint_names``, ``gauge_names`` and ``mode_names`` are used.
     """
     if states is None or not states.stamp.size:
         raise FlexarmError("is not in the recording", field="arm_state")

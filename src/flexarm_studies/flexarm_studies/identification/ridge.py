@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ridge regression whose strength is chosen by cross-validation in blocks of consecutive samples."""
+"""Does ridge regression, with a strength that cross-validation in blocks of consecutive samples chooses."""
 
 import numpy as np
 from scipy.linalg import eigh
 
 #: Blocks of the cross-validation.
 BLOCKS = 5
-#: Strengths of the ridge, beside the mean square of all regressors [-].
+#: Strengths of the ridge, relative to the mean square of all regressors [-].
 RIDGES = 10.0 ** np.arange(-4.0, 3.1, 0.5)
 #: Smallest mean square.
 LEAST = 1e-300
@@ -21,13 +21,13 @@ def chosen(X, Y, weight):
         Regressors.
     Y : ndarray, shape (s, g)
     weight : ndarray, shape (g,)
-        Of each column's squares.
+        Weight of each column's squares.
 
     Returns
     -------
     coefficients : ndarray, shape (p,)
     left : float
-        Of the weighted sum of squares of `Y`, in blocks that the regression was not fitted to [-].
+        Remaining fraction of the weighted sum of squares of `Y`, in blocks to which the regression was not fitted [-].
     """
     strengths = len(X) * max(float(np.mean(X**2)), LEAST) * RIDGES
     left = np.zeros(len(strengths))
@@ -49,7 +49,7 @@ def _solved(X, Y, weight, strengths):
 
 
 def lagged(columns, first, last):
-    """The `columns` (s, c) of `first` samples ago (negative: to come), and so on to `last`, side by side.
+    """The `columns` (s, c) of `first` samples ago (negative: in the future), and so on to `last`, side by side.
 
     Rows that reach beyond the ends are zero there.
     """

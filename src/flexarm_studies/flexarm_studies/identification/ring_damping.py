@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Damping from ring-downs: after a fit of strains, its damping parameters are fitted to the decay of free vibration.
+r"""Fits the damping parameters of a fit of strains to the decay of free vibration in ring-downs.
 
-A sum of squares of strains overestimates damping. Where a model's frequency is off by a fraction s, model and arm are
-out of step after 1/2s periods, and from then on the sum is smaller the faster the model's vibration dies away. The
+A sum of squares of strains overestimates damping. If a model's frequency is off by a fraction s, model and arm have
+opposite phase after 1/2s periods. From then on, the faster the model's vibration decays, the smaller the sum is. The
 decay itself does not depend on the phase. With the damping ratios :math:`\zeta_r` of ring-downs, found in measured and
-modelled strains alike, and the mean squares :math:`V_g` of the residuals of the gauges, this minimises
+in modelled strains, and the mean squares :math:`V_g` of the residuals of the gauges, this minimises
 
 .. math::
     \sum_r \Bigl(\frac{\ln(\zeta_r/\hat\zeta_r)}{s_\zeta}\Bigr)^2 + \sum_g \Bigl(w\,\bigl(V_g/V_{g0} - 1\bigr)\Bigr)^2,
 
-:math:`V_{g0}` those of the fit: the damping may become right at the cost of a few per cent of the residuals. All other
-parameters stay as they are.
+where :math:`V_{g0}` are those of the fit. So the damping may become correct at the cost of a few per cent of the
+residuals. All other parameters stay as they are.
 """
 
 import numpy as np
@@ -29,26 +29,26 @@ DAMPING = (
 SPREAD, WEIGHT = 0.3, 6.0
 #: Smallest damping ratio that counts, and smallest and largest factor of a quantity.
 LEAST, LOW, HIGH = 1e-4, 0.01, 4.0
-#: Relative step of differences, and evaluations.
+#: Relative step of differences, and number of evaluations.
 STEP, EVALUATIONS = 0.03, 7
-#: Ring-downs that are needed.
+#: Number of ring-downs that are needed.
 MIN_RING_DOWNS = 3
 
 
 def fit(problem, report):
-    """Change the free damping quantities of a fitted `problem` to those of its recording's ring-downs.
+    """Change the free damping quantities of a fitted `problem` so that they match its recording's ring-downs.
 
     Parameters
     ----------
     problem : StrainProblem
         After `finish`.
     report : callable
-        ``report(label)`` says what is done.
+        Called as ``report(label)`` with what is done.
 
     Returns
     -------
     list of int
-        Indices of the quantities that were changed; none where there are too few ring-downs.
+        Indices of the quantities that were changed; none if there are too few ring-downs.
     """
     rings = _found(problem)
     which = [
@@ -84,7 +84,7 @@ def fit(problem, report):
 
 
 def _squares(problem, made):
-    """Mean square of the residuals of each gauge that reads something."""
+    """Mean square of the residuals of each gauge that has readings."""
     error = np.where(problem.known, problem.measured - made, np.nan)
     return np.nanvar(error[:, problem.known.any(axis=0)], axis=0)
 

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How well predicted strains explain measured ones: beside what needs no model, and beside what the noise allows.
+r"""Scores how well predicted strains explain measured ones, compared with model-free baselines and the noise ceiling.
 
-The variance accounted for of each gauge, also above a frequency (Butterworth of order four, without phase),
+The score is the variance accounted for (VAF) of each gauge, also above a frequency (Butterworth of order four, without
+phase),
 
 .. math:: \mathrm{VAF} = 1 - \frac{\mathrm{Var}(\varepsilon - \hat\varepsilon)}{\mathrm{Var}(\varepsilon)} .
 
-Three baselines are linear regressions on the joint motion, made on the fitted part and scored on the other:
-**quasi-static**, on what the weight does to a rigid arm, :math:`1, \cos a_i, \sin a_i` of the links' absolute angles
-a; **rigid**, with its inertial terms, :math:`\ddot a_i` and, for each pair, :math:`\cos(a_j - a_i)\,\ddot a_i`,
-:math:`\cos(a_j - a_i)\,\ddot a_j`, :math:`\sin(a_j - a_i)\,\dot a_i^2`,
-:math:`\sin(a_j - a_i)\,\dot a_j^2`; and **FIR**, the same terms of the last samples,
-too. For two joints these have 5, 11 and 211 coefficients. The ceiling is what would
-be left to a perfect model: the noise of the gauges at rest.
+Three baselines are linear regressions on the joint motion, fitted on the fitted part and scored on the other:
+**quasi-static**, on the effect of the weight on a rigid arm, :math:`1, \cos a_i, \sin a_i` of the links' absolute
+angles a; **rigid**, with its inertial terms, :math:`\ddot a_i` and, for each pair, :math:`\cos(a_j - a_i)\,\ddot a_i`,
+:math:`\cos(a_j - a_i)\,\ddot a_j`, :math:`\sin(a_j - a_i)\,\dot a_i^2`, :math:`\sin(a_j - a_i)\,\dot a_j^2`; and
+**FIR**, also on the same terms of the last samples. For two joints these have 5, 11 and 211 coefficients. The ceiling
+is the score of a perfect model, limited by the noise of the gauges at rest.
 """
 
 import itertools
@@ -29,7 +29,7 @@ SINGULAR = 1e-8
 
 
 def high_passed(values, period, above):
-    """The columns of `values` (s, g) without what is below a frequency `above` [Hz]; `period` is of a row [s]."""
+    """The columns of `values` (s, g) without what is below `above` [Hz]; `period` is between rows [s]."""
     passes = butter(ORDER, above, "high", fs=1.0 / period, output="sos")
     return sosfiltfilt(passes, values, axis=0)
 
@@ -40,10 +40,10 @@ def explained(measured, predicted, part, period, above):
     Parameters
     ----------
     measured, predicted : ndarray, shape (s, g)
-        Strains [-]; samples that were not measured are left out, and not above the frequency.
+        Strains [-]; samples that were not measured are left out, but not for the score above the frequency.
     part : slice
     period : float
-        Between samples [s].
+        Time between samples [s].
     above : float
         Frequency [Hz].
 
@@ -92,7 +92,7 @@ def regressors(position, velocity, acceleration):
 
 
 def baselines(motion, measured, fitted):
-    """Predictions that need no model, shape (s, g) each, and their number of coefficients: name to both.
+    """Predictions without a model, shape (s, g) each, and their numbers of coefficients: name to both.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def _regressed(X, measured, fitted):
 
 
 def ceiling(recording, measured, part, above):
-    """Scores of a perfect model, by the noise in a `recording`'s longest rest without ringing; None without one.
+    """Scores of a perfect model, from the noise in a `recording`'s longest rest without ringing; None without one.
 
     `measured` (s, g), `part` and `above` are as for `explained`.
     """
@@ -160,7 +160,7 @@ def ring_downs(recording, predicted, noise):
 
 
 def whiteness(error):
-    """Correlation of residuals (s,) from one sample to the next, and the bound within which 95 % of white ones are."""
+    """Correlation of residuals (s,) between successive samples, and the bound that 95 % of white ones keep."""
     e = error[np.isfinite(error)]
     e = e - e.mean()
     return float(e[1:] @ e[:-1] / max(e @ e, 1e-300)), 1.959964 / np.sqrt(max(e.size, 1))

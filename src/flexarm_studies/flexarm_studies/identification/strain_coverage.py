@@ -2,8 +2,8 @@
 """How often the intervals of fits to strains alone cover the truth, for simulated arms with play drawn at random.
 
 ``python -m flexarm_studies.identification.strain_coverage --arms 100`` draws arms around `NOMINAL`, moves their joint
-as a position control would, and measures: strains with noise of which most is common to the gauges and follows from
-sample to sample, with bias, drift and a delay; the motor's current with friction. Each one is identified from the
+as a position control would, and measures. The strains have bias, drift, a delay, and noise of which most is common to
+the gauges and correlated from sample to sample. The motor's current includes friction. Each arm is identified from the
 nominal arm's file.
 """
 
@@ -43,7 +43,7 @@ gauges:
 - {name: root, link: beam, position: 0.05, direction: y, surface_distance: 0.003}
 - {name: middle, link: beam, position: 0.3, direction: y, surface_distance: 0.003}
 """
-#: Known to the user, and held at the true value.
+#: Parameters that the user knows; they are held at the true value.
 HOLD = ("joints[0].hub_inertia", "payload.mass")
 #: Largest relative deviation of each parameter from the nominal one [-]; of biases, drifts [-], delays [s] and offsets
 #: [rad].
@@ -52,7 +52,7 @@ BIAS, DRIFT, DELAY, OFFSET = 50e-6, 15e-6, 0.008, 0.03
 #: Noise that gauges share, its memory, and noise of each [-]; of the current [A]; torque per ampere [N m/A].
 COMMON, MEMORY, OWN, OF_CURRENT, CONSTANT = 1.0e-6, 0.5, 0.3e-6, 0.03, 12.0
 RATE, SECONDS = 100.0, 10.0
-#: Steps of the simulated arm in one of the fit's: the fit is not to know its own errors of integration.
+#: Steps of the simulated arm per step of the fit: so the simulation does not have the fit's errors of integration.
 FINER = 4
 #: Starts of each fit.
 STARTS = 3
@@ -124,7 +124,7 @@ def one(seed):
 
 
 def run(arms, seed=0, count=None, progress=None, path=None):
-    """Rows of so many `arms`, each identified from its own recording, as `one` gives them.
+    """Rows of this number of `arms`, each identified from its own recording, as `one` gives them.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def run(arms, seed=0, count=None, progress=None, path=None):
     progress : callable, optional
         ``progress(done)``
     path : str or Path, optional
-        File with a line of JSON for each arm that is done; those that it has are not computed again.
+        File with a line of JSON for each arm that is done; arms in it are not computed again.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def run(arms, seed=0, count=None, progress=None, path=None):
 
 
 def _kept(path):
-    """What a file of `run` has: (seed, arm) to rows."""
+    """Content of a file of `run`: (seed, arm) to rows."""
     if path is None or not Path(path).exists():
         return {}
     try:

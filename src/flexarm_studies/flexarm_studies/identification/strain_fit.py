@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Fit of an arm's parameters to strains alone, its joints' motion prescribed as measured.
+r"""Fits an arm's parameters to strains alone, with the motion of its joints prescribed as measured.
 
-With residuals :math:`e_k = \varepsilon_k - \hat\varepsilon_k(\theta)` of `prescribed`, the parameters are those of
+With residuals :math:`e_k = \varepsilon_k - \hat\varepsilon_k(\theta)` of `prescribed`, the parameters minimise
 
 .. math::
     \min_\theta \sum_k \bigl|L^{-1}(e_k - \rho\,e_{k-1})\bigr|^2, \qquad
     LL^T = \mathrm{Cov}(e_k - \rho\,e_{k-1}),
 
-beside a wide prior about the file's values: generalised least squares with an autoregression :math:`\rho` of each
-gauge and a covariance between the gauges, both from the residuals (Ljung, System Identification, 1999, 7.4). What a
-model leaves is slow where it lacks friction, and the same in all gauges where they share a source of noise: without
-this, the slow part hides the vibration, and noise that could be taken off by comparing gauges counts as noise of each.
+with a wide prior about the file's values. These are generalised least squares with an autoregression :math:`\rho` of
+each gauge and a covariance between the gauges, both from the residuals (Ljung, System Identification, 1999, 7.4). The
+residuals are slow if the model lacks friction, and the same in all gauges if these share a source of noise. Without the
+weights, the slow part would hide the vibration, and noise that a comparison of gauges removes would count as noise of
+each gauge.
 
-The sum has many minima. The fit begins at several points, the first one the arm file's: at each, gains and biases
-follow by linear regression, then delays, offsets and drifts are held for the first steps; the best one goes on
-with all. Intervals are those of `fit` (Newey and West). A combination of parameters along which no strain changes is
-named, and one of it keeps the file's value. A parameter whose interval is too wide is named, too. It keeps its fitted
-value, for the others belong to it.
+The sum has many minima. The fit begins at several points; the first one is that of the arm file. At each, gains and
+biases follow by linear regression; then delays, offsets and drifts are held for the first steps. The best point goes on
+with all quantities. Intervals are those of `fit` (Newey and West). A combination of parameters along which no strain
+changes is named, and one of these parameters keeps the file's value. A parameter whose interval is too wide is named,
+too. It keeps its fitted value, because the values of the others depend on it.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -42,42 +43,42 @@ from .strain_quantities import (
     with_offset,
 )
 
-#: Held unless the user frees them: strains can't tell them from others, or a ruler can.
+#: Held unless the user frees them: strains can't tell them from others, or a ruler measures them.
 HELD = ("links[*].mass_per_length", "gauges[*].position")
 #: Difference step of the Jacobian, as a fraction of a quantity's scale [-].
 STEP = 1e-7
-#: Autoregression of the residuals before they are known [-], and their size, as a fraction of the signal's [-].
+#: Autoregression of the residuals before they are known [-], and their size, as a fraction of the signal [-].
 FIRST_MEMORY, FIRST_NOISE = 0.9, 0.02
-#: Residuals are taken to be forgotten within this [s], even where they last longer: with an autoregression of one, the
-#: level of a gauge would not count at all. A smaller one than the true is as any filter of the residuals: the values
-#: are still consistent, and the intervals allow for what is left of the colour.
+#: Residuals are assumed to last at most this long [s], even if they last longer: with an autoregression of one, the
+#: level of a gauge would have no effect. An autoregression smaller than the true one acts like any filter of the
+#: residuals: the values are still consistent, and the intervals allow for the remaining colour.
 MAX_MEMORY_TIME = 0.5
-#: Starts, and the range of factors of stiffness and play from the second one on.
+#: Number of starts, and range of factors of stiffness and play from the second one on.
 STARTS, RANGE = 6, (0.6, 1.7)
 #: Kinds that a start varies; kinds that stay as they are for its first steps.
 VARIED = ("EI", "transmission_stiffness", "transmission_play")
 LATER = ("offset", "delay", "drift", "hub_inertia")
-#: Each start is fitted to the first samples, this fraction of all, at least so many seconds of them.
+#: Each start is fitted to the first samples: this fraction of all, and at least this many seconds.
 START_PART, START_SECONDS = 0.35, 10.0
 #: Evaluations of a start, and of each pass with new weights; largest number of passes.
 START_STEPS, PASS_STEPS, PASSES = 12, 20, 10
-#: From the second pass on, secants stand for derivatives until so many evaluations were made: one derivative of all
-#: quantities costs as much as 25 of these. Far from the values they lead astray.
+#: From the second pass on, secants replace derivatives for this number of evaluations: one derivative of all quantities
+#: costs as much as 25 evaluations. Far from the final values, secants mislead.
 BETWEEN = 3
 #: Relative tolerance of the sum of squares in the first pass, whose weights are those of a poor fit.
 FIRST_TOLERANCE = 1e-4
-#: The weights belong to the values once a pass leaves at least this fraction of the sum of squares, and the
-#: autoregression that follows from its residuals is within this of the one that weighed them [-].
+#: The weights fit the values when a pass leaves at least this fraction of the sum of squares, and the autoregression
+#: from its residuals differs by at most this from the one in the weights [-].
 SETTLED, SAME_MEMORY = 0.98, 0.01
 #: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
 SINGULAR = 1e-4
-#: Deviation of the prior about the file's value, in scales: what strains hardly tell stays near it [-].
+#: Deviation of the prior about the file's value, in scales [-]: what strains hardly determine stays near it.
 PRIOR = 1.0
-#: What takes part in a combination: this fraction of the singular vector [-].
+#: A quantity takes part in a combination if it has this fraction of the singular vector [-].
 INVOLVED = 0.03
 #: Smallest noise [-].
 MIN_NOISE = 1e-9
-#: A residual of a model that diverges, in deviations.
+#: Residual of a model that diverges, in deviations.
 LOST = 1e4
 
 
@@ -88,16 +89,16 @@ class Options:
     Attributes
     ----------
     hold, free : tuple of str
-        Names, or patterns with ``*``, of quantities that keep the file's value, and of `HELD` ones that don't.
+        Names, or patterns with ``*``, of quantities that keep the file's value, and of `HELD` ones that do not.
     limit : float
         A quantity is undetermined if its half-width exceeds this fraction of its value [-].
     starts : int
     corner : float
-        Of the low pass of the joint angles [Hz].
+        Corner of the low pass of the joint angles [Hz].
     lead : int
         Samples at the beginning that are predicted, but not compared.
     ring_downs : bool
-        Whether damping is fitted to the decay of ring-downs in the end, see `ring_damping`.
+        Whether damping is finally fitted to the decay of ring-downs, see `ring_damping`.
     """
 
     hold: tuple = ()
@@ -116,26 +117,26 @@ class StrainFit:
     Attributes
     ----------
     arm : Arm
-        With the fitted values, offsets of its joints included.
+        With the fitted values, including the offsets of its joints.
     setup : Setup
         The same arm without the offsets, and how it was recorded.
     quantities : list of Quantity
     values, half_widths : ndarray, shape (p,)
         Values, and half-widths of the 95 % intervals, NaN where the file's value was kept [SI].
     covariance : ndarray, shape (p, p)
-        Of the values; zero where they are held.
+        Covariance of the values; zero where they are held.
     predicted, measured : ndarray, shape (s, g)
         Strains of the fit, and of the recording.
     noise, memory : ndarray, shape (g,)
         Rms of the residuals' part that is new in each sample [-], and their autoregression [-].
     correlation : ndarray, shape (g, g)
-        Of that part between the gauges.
+        Correlation of that part between the gauges.
     held, undetermined : tuple of str
         Kept on request or by default; not determined by the strains (those with a half-width have fitted values).
     alike : tuple of tuple of str
-        Combinations along which no strain changes: of all quantities, held ones too, but where all of the arm is held.
+        Combinations along which no strain changes: of all quantities, also held ones, unless the whole arm is held.
     starts : tuple of float
-        Sum of squares that each start ended with; the smallest went on.
+        Final sum of squares of each start; the fit went on from the smallest.
     warnings : tuple of str
     """
 
@@ -158,23 +159,23 @@ class StrainFit:
 
 
 def identify_strains(arm, recording, options=None, run=None, state=None, report=None, threads=1):
-    """Fit an arm's parameters to the strains of a recording, its joint motion prescribed.
+    """Fit an arm's parameters to the strains of a recording, with its joint motion prescribed.
 
     Parameters
     ----------
     arm : Arm
     recording : Recording
-        It should begin at rest: the links start so.
+        It should begin at rest, because the links start at rest.
     options : Options, optional
     run : callable, optional
-        ``run(function, calls)`` yields (i, ``function(*calls[i])``), as `workers.results`; here, one by one, if not
-        given.
+        ``run(function, calls)`` yields (i, ``function(*calls[i])``), as `workers.results`; if not given, the calls run
+        here, one by one.
     state : FitState, optional
-        Where the fit goes on if it was interrupted, and what it has found so far.
+        What the fit has found so far; an interrupted fit goes on from there.
     report : callable, optional
         ``report(label)`` at each step.
     threads : int
-        That compute derivatives; the numbers do not depend on it.
+        Number of threads that compute derivatives; the results do not depend on it.
 
     Returns
     -------
@@ -183,8 +184,8 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
     Raises
     ------
     FlexarmError
-        For a pattern that matches nothing, an arm without gauges, joints that do not move, and where no start can
-        follow the motion.
+        For a pattern that matches nothing, an arm without gauges, joints that do not move, and if no start can follow
+        the motion.
     """
     options = options or Options()
     report = report or (lambda label: None)
@@ -217,14 +218,14 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
 
 
 def fit_start(arm, recording, options, number, threads=1):
-    """Fit from one start: sum of squares, which compares between starts, and values (p,)."""
+    """Fit from one start; return the sum of squares, which is comparable between starts, and values (p,)."""
     part = max(
         START_PART * (len(recording.position) - options.lead), START_SECONDS / recording.period
     )
     found = strain_quantities(arm, recording)
     problem = StrainProblem(arm, recording.part(options.lead + int(part)), options, found, threads)
     problem.begin(0)
-    problem.weigh_each()  # all starts alike, so that their sums compare
+    problem.weigh_each()  # all starts in the same way, so their sums are comparable
     problem.begin(number)
     problem.solve(START_STEPS, 1e-3, LATER)
     return problem.cost, problem.values
@@ -241,7 +242,7 @@ class StrainProblem:
     found : list of Quantity, optional
         Those of `strain_quantities` if not given.
     threads : int
-        That compute derivatives.
+        Number of threads that compute derivatives.
     """
 
     def __init__(self, arm, recording, options, found=None, threads=1):
@@ -297,7 +298,7 @@ class StrainProblem:
         return self.predictor.strains(setup.arm, *states, setup.delay, drift)
 
     def new_part(self, e):
-        """What of residuals (s, g) does not follow from the sample before; 0 where one of both is unknown."""
+        """The part of residuals (s, g) that does not follow from the sample before; 0 where either is unknown."""
         out = np.empty_like(e)
         out[0] = e[0] * np.sqrt(1.0 - self.memory**2)
         out[1:] = e[1:] - self.memory * e[:-1]
@@ -306,11 +307,11 @@ class StrainProblem:
         return np.where(known, out, 0.0)
 
     def weighted(self, e):
-        """Residuals (s, g) as the sum of squares has them."""
+        """Residuals (s, g) with the weights of the sum of squares."""
         return self.new_part(np.where(self.known, e, 0.0)) @ self.whiten
 
     def made(self, values):
-        """Strains that the model makes with these values, shape (s, g); NaN where it diverges."""
+        """Strains of the model with these values, shape (s, g); NaN where it diverges."""
         setup = self.at(values)
         return self.strains(setup, self.states(setup))
 
@@ -330,7 +331,7 @@ class StrainProblem:
         return self.of_derivatives(self.derivatives(values, which))
 
     def of_derivatives(self, D):
-        """Derivative of the weighted residuals, from that of the strains, shape (s, g, p) both."""
+        """Derivative of the weighted residuals, from that of the strains, both of shape (s, g, p)."""
         J = np.stack([self.weighted(-column) for column in np.moveaxis(D, 2, 0)], axis=2)
         return np.nan_to_num(J, nan=0.0, posinf=0.0, neginf=0.0)
 
@@ -357,7 +358,7 @@ class StrainProblem:
     # The fit ---------------------------------------------------------------------------------
 
     def begin(self, number):
-        """Take the values of a start: the file's, or others drawn for its `number`; gains and biases by regression."""
+        """Take the values of a start: the file's, or values drawn for its `number`; gains and biases by regression."""
         self.values = self.file.copy()
         if number:
             random = np.random.default_rng(number)
@@ -386,7 +387,7 @@ class StrainProblem:
                 self.values[bias] = level
 
     def solve(self, steps, tolerance, later=(), keep=None, between=0):
-        """Least squares from the current values, in so many `steps` at most, to a relative `tolerance` of the sum.
+        """Least squares from the current values, in at most `steps` steps, to a relative `tolerance` of the sum.
 
         Quantities of the kinds `later` are held; ``keep()`` is called after each step; derivatives are computed anew
         after `between` evaluations.
@@ -433,7 +434,7 @@ class StrainProblem:
             steps -= done.nfev
             start = self.best[1][which] / self.scale[which]
             if secant.fresh or not self.best[0] < (1.0 - tolerance) * before:
-                break  # not by the secants' fault
+                break  # the secants are not the reason
         self.cost, self.values = self.best
 
     def left(self):
@@ -443,7 +444,7 @@ class StrainProblem:
         return e if np.isfinite(e).all() else None
 
     def weigh_each(self):
-        """Weigh each gauge by what is left of it: of a poor fit, what gauges have alike is vibration, not noise."""
+        """Weigh each gauge by its residual: after a poor fit, what gauges have in common is vibration, not noise."""
         e = self.left()
         if e is not None:
             new = self.new_part(e)
@@ -452,7 +453,7 @@ class StrainProblem:
             self.whiten = np.diag(1.0 / np.maximum(size, MIN_NOISE))
 
     def weigh(self):
-        """Memory and covariance of the residuals, and the weights that follow from them."""
+        """Compute memory and covariance of the residuals, and the weights that follow from them."""
         e = self.left()
         if e is None:
             return
@@ -470,7 +471,7 @@ class StrainProblem:
         self.whiten = np.linalg.inv(np.linalg.cholesky(covariance)).T
 
     def finish(self, report, state):
-        """From the values of the best start to the end: passes with new weights, parameters that act alike left out."""
+        """Fit from the values of the best start: passes with new weights, parameters of equal effect left out."""
         stage = 0 if state is None or state.best is None else state.best["stage"]
         self.weigh()
         settled = stage >= PASSES
@@ -507,7 +508,7 @@ class StrainProblem:
         return keep
 
     def snapshot(self, stage):
-        """Plain data to go on from."""
+        """Plain data from which the fit can go on."""
         return {
             "stage": stage,
             "values": [float(v) for v in self.values],
@@ -523,13 +524,13 @@ class StrainProblem:
     # What is determined ----------------------------------------------------------------------
 
     def covariance(self):
-        """Of the free quantities, scaled."""
+        """Covariance of the free quantities, scaled."""
         which = np.flatnonzero(self.free)
         J, r = self.jacobian(self.values, which), self.residuals(self.values)
         return robust_covariance(J, r, self.used)
 
     def leave_out_alike(self):
-        """Name combinations along which no strain changes; of free ones one quantity keeps the file's value."""
+        """Name combinations along which no strain changes; one free quantity in each keeps the file's value."""
         looked_at = self._looked_at()
         J = np.zeros((self.measured.size, len(self.found)))
         J[:, looked_at] = self.jacobian(self.values, looked_at).reshape(-1, looked_at.size)
@@ -549,7 +550,7 @@ class StrainProblem:
             self.leave_out(least, "it changes no strain" if alone else f"{names} act alike")
 
     def _looked_at(self):
-        """Indices of the quantities whose combinations are named: all, or the free ones where the whole arm is held."""
+        """Indices of the quantities whose combinations are named: all, or the free ones if the whole arm is held."""
         held_by_user = held(self.found, self.options.hold)
         parts = ("joints[", "links[", "payload.")
         whole = all(q.name in held_by_user for q in self.found if q.name.startswith(parts))
@@ -610,7 +611,7 @@ class StrainProblem:
 
 
 class Secant:
-    r"""Values and derivatives of a function whose derivatives cost much: after the first ones, by Broyden's secants.
+    r"""Values and derivatives of a function with expensive derivatives: after the first ones, by Broyden's secants.
 
     .. math:: D \leftarrow D + (y_1 - y_0 - D\,\Delta x)\,\Delta x^T / |\Delta x|^2
 
@@ -619,7 +620,7 @@ class Secant:
     function, derivatives : callable
         ``function(x)`` of shape (s, g), ``derivatives(x)`` (s, g, p), for x (p,).
     between : int
-        Values after which derivatives are computed anew.
+        Number of values after which derivatives are computed anew.
     """
 
     def __init__(self, function, derivatives, between):
@@ -629,7 +630,7 @@ class Secant:
 
     @property
     def fresh(self):
-        """Whether the last derivatives are no secants."""
+        """Whether the last derivatives are not secants."""
         return self._count == 0
 
     def forget(self):
@@ -670,7 +671,7 @@ def _any(found, pattern):
 
 
 def _null(J, size, indices):
-    """Combinations of columns of J, lists of `indices`, along which it does not change; `size` (p,) is of columns."""
+    """Combinations of columns of J, lists of `indices`, along which it is constant; `size` (p,) is that of columns."""
     silent = size <= 1e-9 * max(size.max(initial=0.0), 1e-300)
     if silent.any() or not size.size:
         return [[int(j)] for j in indices[silent]]
@@ -689,7 +690,7 @@ def predict(found, recording, options, middle=None):
     options : Options
         Those of the fit.
     middle : float, optional
-        Time of no drift in this recording [s]; None: the readings don't drift.
+        Time of no drift in this recording [s]; None: the readings do not drift.
     """
     setup = found.setup
     predictor = MotionPredictor(setup.arm, recording, options.corner)
@@ -701,13 +702,13 @@ def predict(found, recording, options, middle=None):
 
 
 def of_recording(found):
-    """What a `StrainFit` found of the recording, not of the arm: name to value."""
+    """What a `StrainFit` found about the recording, not about the arm: name to value."""
     pairs = zip(found.quantities, found.values, strict=True)
     return {q.name: float(v) for q, v in pairs if q.kind in OF_RECORDING}
 
 
 def with_noise(found):
-    """The fitted arm with the noise of its gauges: what is new in each residual."""
+    """The fitted arm with the noise of its gauges, that is, the new part of each residual."""
     gauges = (
         replace(g, noise=float(s)) for g, s in zip(found.arm.gauges, found.noise, strict=True)
     )

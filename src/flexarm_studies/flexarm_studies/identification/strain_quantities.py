@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What strains under a prescribed motion can tell: numbers of the arm file, and how the recording was made.
+"""Lists what strains under a prescribed motion can determine: numbers of the arm file, and how it was recorded.
 
-Beside those of `quantities` these are the parts of transmissions, what moves with the joints, where gauges sit, and of
-the recording alone: an angle that a joint's zero is off by, and each channel's delay and drift. How heavy and how stiff
-everything is does not show in strains, only the ratio: masses per length keep the file's value.
+In addition to those of `quantities`, these are the parts of transmissions, what moves with the joints, and the
+positions of gauges. For the recording alone there are the error of a joint's zero angle, and each channel's delay and
+drift. Strains show only the ratio of mass and stiffness, not both: masses per length keep the file's value.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ TRANSMISSION = {
     "rounding": ("none", "rad", 5e-4),
     "play_damping": ("viscous", "N m s/rad", 0.5),
 }
-#: Parts that only matter where there is play.
+#: Parts that only matter if there is play.
 OF_PLAY = ("rounding", "play_damping")
 #: Scales of what belongs to the recording: angle [rad], delay [s], drift over the recording [-].
 OFFSET, DELAY, DRIFT = 0.02, 0.005, 1e-5
@@ -35,11 +35,11 @@ class Setup:
     ----------
     arm : Arm
     offset : ndarray, shape (n,)
-        Angle of each joint less the recorded one [rad].
+        Angle of each joint minus the recorded one [rad].
     delay : ndarray, shape (g,)
-        By which each strain channel is late [s].
+        Time by which each strain channel is late [s].
     drift : ndarray, shape (g,)
-        Change of each reading by itself over the fitted part [-].
+        Drift of each reading over the fitted part [-].
     """
 
     arm: object
@@ -56,7 +56,7 @@ class Setup:
 
 #: Kinds that belong to the recording, and the attribute of `Setup` that has them.
 OF_RECORDING = {"offset": "offset", "delay": "delay", "drift": "drift"}
-#: Kinds that only change what the gauges read, not how the arm moves.
+#: Kinds that only change the readings of the gauges, not the motion of the arm.
 OF_GAUGES = ("gain", "bias", "position", "delay", "drift")
 
 
@@ -79,7 +79,7 @@ def changed(setup, found, values):
 
 
 def strain_quantities(arm, recording):
-    """All quantities that strains of a `recording` may tell of an `arm`, in the file's order."""
+    """All quantities of an `arm` that strains of a `recording` may determine, in the file's order."""
     made = []
     add = lambda *given: made.append(quantity(arm, *given))  # noqa: E731
     for i, joint in enumerate(arm.joints):
@@ -97,7 +97,7 @@ def strain_quantities(arm, recording):
             Quantity(f"{joint.name} offset", "offset", (i,), "rad", "none", OFFSET, -np.inf)
         )
     for i, link in enumerate(arm.links):
-        if link.uniform:  # the file gives sections in their place
+        if link.uniform:  # the file gives sections in place of these
             name = f"links[{i}].mass_per_length"
             add(name, "mass_per_length", (i,), "kg/m", "mass_per_length", 1e-3)
         for direction, flexibility in link.flexible.items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm identified without torque from one part of a recording, and scored on another."""
+"""Identifies an arm without torque from one part of a recording, and scores it on another."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from .currents import motor_fits
 from .prescribed import MotionPredictor
 from .strain_fit import Options, identify_strains, predict
 
-#: Where joints move at the beginning of the fitted part, the prediction begins so much before it [s].
+#: If joints move at the beginning of the fitted part, the prediction begins up to this time before it [s].
 LEAD = 10.0
 
 
@@ -25,11 +25,11 @@ class Study:
     Attributes
     ----------
     fit, score : tuple of float, or None
-        Beginning and end, as the recording counts the time [s]; None: all of it, and nothing but the fitted part.
+        Beginning and end, as the recording counts the time [s]; None: fit all of it, and score only the fitted part.
     above : float
-        Frequency above which scores are given beside those of everything [Hz].
+        Frequency above which scores are given in addition to the full ones [Hz].
     pickup : float, or None
-        Frequency above which gauges are taken to pick up the motor currents, see `pickup` [Hz]; None: they don't.
+        Frequency above which gauges are assumed to pick up the motor currents, see `pickup` [Hz]; None: they do not.
     """
 
     fit: tuple | None = None
@@ -55,7 +55,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
     options : Options, optional
         Its `lead` is set here.
     other : Recording, optional
-        What is scored, if not the same; its biases are taken anew where it rests.
+        The recording that is scored, if it is another one; its biases are determined anew while it rests.
     fitting
         As for `identify_strains`.
 
@@ -103,7 +103,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
 
 
 def _begin(recording, start):
-    """Where the prediction begins: at the `start` [s] if the joints stand there, else at rest before it."""
+    """Beginning of the prediction: at the `start` [s] if the joints stand there, otherwise at rest before it."""
     still = rest.still(recording)
     row = min(max(round((start - recording.start) / recording.period), 0), len(still) - 1)
     before = max(row - round(LEAD / recording.period), 0)
@@ -112,14 +112,14 @@ def _begin(recording, start):
 
 
 def _picked(run, predicted, fitted, wanted):
-    """The `Pickup` that was asked for, or None."""
+    """The requested `Pickup`, or None."""
     if wanted.pickup is None:
         return None
     return pickup.fit(run, run.strain - predicted, fitted, wanted.pickup)
 
 
 def _with_pickup(made, sizes, picked, run):
-    """Add to the predictions `made` that of the model with what the gauges pick up, if that is of use."""
+    """Add to the predictions `made` that of the model with what the gauges pick up, if that is useful."""
     if picked is not None and picked.useful:
         made["with pickup"] = made["model"] + picked.strain(run)[:, None]
         sizes["with pickup"] = picked.taps.size
@@ -137,7 +137,7 @@ def _noise(recording, found):
 
 
 def _scored(found, recording, run, predicted, picked, part, fitted, wanted, options):
-    """Scores of the model and of what needs none on a `part` of a run, as plain data."""
+    """Scores of the model and of the baselines without a model on a `part` of a run, as plain data."""
     if part.stop - part.start < 20:
         raise FlexarmError(
             "has too few samples", field="scored part", value=part.stop - part.start, limit=20

@@ -24,13 +24,14 @@ from flexarm_dynamics.errors import FlexarmError, TrajectoryError
 
 from . import scenario
 
-#: Without a duration a motion takes so many periods of the lowest mode, and uses these parts of speed and torque.
+#: Default duration of a motion in periods of the lowest mode, and fraction of the limits of speed and torque that it
+#: uses.
 PERIODS, PART = 3.0, 0.5
-#: And at least this long [s]; it takes this much longer where the torque does not suffice [-].
+#: Minimum duration [s], and factor by which the duration is increased while the torque does not suffice [-].
 MIN_DURATION, LONGER = 0.5, 1.3
-#: Points of a motion.
+#: Number of points of a motion.
 POINTS = 201
-#: A simulated arm that has not come to rest so long after a motion's end does not [s].
+#: Max. time after a motion's end in which a simulated arm must come to rest [s].
 PATIENCE = 60.0
 
 
@@ -45,17 +46,17 @@ class Reading:
     Attributes
     ----------
     time : float
-        Of the arm's clock [s].
+        Time of the arm's clock [s].
     position, velocity, reference, torque : ndarray, shape (n,)
-        Of the joints [rad], [rad/s], [rad], [N m].
+        Values of the joints [rad], [rad/s], [rad], [N m].
     amplitude : ndarray, shape (m,)
-        Of the modes, from the gauges [m, rad].
+        Modal amplitudes, from the gauges [m, rad].
     tip : ndarray, shape (3,)
-        From both [m].
+        Position of the tip, from both [m].
     supervisor : str
         READY, TRACKING, HOLDING, STOPPING, FAULT or INACTIVE.
     reason : str
-        Why there is no torque, or why the last trajectory was refused; else empty.
+        Why there is no torque, or why the last trajectory was refused; otherwise empty.
     """
 
     time: float
@@ -71,14 +72,14 @@ class Reading:
 
 @dataclass(frozen=True)
 class Arrival:
-    """How a motion ended well.
+    """How a motion ended successfully.
 
     Attributes
     ----------
     seconds : float
-        Until the tip had come to rest, by the arm's clock [s].
+        Time until the tip had come to rest, by the arm's clock [s].
     tip_swing : float
-        How far it still swung, at most [m].
+        Its largest remaining swing [m].
     """
 
     seconds: float
@@ -86,7 +87,7 @@ class Arrival:
 
 
 class Recording:
-    """What `recording` gives; `record` is there once the block has ended.
+    """Result of `recording`; `record` is available when the block has ended.
 
     Attributes
     ----------
@@ -122,7 +123,7 @@ class BaseArm(ABC):
 
     @abstractmethod
     def recover(self):
-        """Leave a fault; whether there was one."""
+        """Leave a fault; return whether there was one."""
 
     @abstractmethod
     def recording(self):
@@ -130,7 +131,7 @@ class BaseArm(ABC):
 
     @abstractmethod
     def _follow(self, data):
-        """Follow a `JointTrajectoryData` that starts now; an `Arrival`."""
+        """Follow a `JointTrajectoryData` that starts now; return an `Arrival`."""
 
     def move(self, to, duration=None):
         """Move the joints from where they are held, from rest to rest, and wait until the tip has come to rest.
@@ -138,7 +139,7 @@ class BaseArm(ABC):
         Parameters
         ----------
         to : float or (n,) array_like
-            Positions at the end [rad]; a number is for every joint.
+            Positions at the end [rad]; a number counts for every joint.
         duration : float, optional
             Of the motion [s]; not given: a comfortable one, within half of the limits of speed and torque.
 
@@ -149,7 +150,7 @@ class BaseArm(ABC):
         Raises
         ------
         TrajectoryError
-            If the motion can't be made of these numbers.
+            If these numbers do not give a motion.
         MotionError
             If it is refused, or the arm does not arrive.
         """
@@ -167,7 +168,7 @@ class BaseArm(ABC):
         return self.follow(profiles.quintic(start, to, self.comfortable(start, to)))
 
     def comfortable(self, start, to):
-        """A duration for a motion (n,) to (n,) [rad]: `PERIODS` of the lowest mode, `PART` of speed and torque [s]."""
+        """Duration of a motion (n,) to (n,) [rad]: `PERIODS` of the lowest mode, `PART` of speed and torque [s]."""
         speed = PART * np.asarray(self.model.arm.velocity_limits)
         # The quintic's largest speed is 15/8 of its mean.
         time = max((1.875 * np.abs(to - start) / speed).max(), MIN_DURATION)
@@ -187,7 +188,7 @@ class BaseArm(ABC):
         return time
 
     def follow(self, motion):
-        """Follow a motion from where the arm is, and wait until the tip has come to rest.
+        """Follow a motion from the arm's position, and wait until the tip has come to rest.
 
         Parameters
         ----------
@@ -223,7 +224,7 @@ class BaseArm(ABC):
         return trajectory.validate(names, names, 0, points, *specs.limits(self.model))
 
     def _check(self, data, start_ns):
-        """The `GoalCheck` of a motion that starts at a stamp, with the tolerances that nodes have by default."""
+        """The `GoalCheck` of a motion that starts at a stamp, with the default tolerances of the nodes."""
         values = {p.name: p.default for p in goal.PARAMETERS}
         reach = self.arm.reach
         names = self.model.joint_names
@@ -232,7 +233,7 @@ class BaseArm(ABC):
         return goal.GoalCheck(names, limits, end, longest_period(self.model))
 
     def close(self):
-        """Let go of the arm."""
+        """Release the arm."""
 
     def __enter__(self):
         return self
@@ -242,15 +243,15 @@ class BaseArm(ABC):
 
 
 class SimulatedArm(BaseArm):
-    """An arm that is simulated in this process, under observer and controller, as fast as the machine goes.
+    """An arm that is simulated in this process, under observer and controller, as fast as the machine allows.
 
     Parameters
     ----------
     arm : str or Arm
         Arm file: shipped name or path.
     settings : sequence of str
-        Of the control, ``name=value`` each, see `scenario.parameters`; without laws the control is a design's, which
-        takes up to some minutes the first time.
+        Settings of the control, ``name=value`` each, see `scenario.parameters`. Without laws the control is that of a
+        design, which takes up to some minutes the first time.
     file : str or Path, optional
         Parameter file of the control.
     fields
@@ -326,7 +327,7 @@ class SimulatedArm(BaseArm):
         )
 
     def wait(self, seconds):
-        """Let the arm go on for so long [s]."""
+        """Let the arm go on for a time [s]."""
         for _ in range(round(seconds * 1e9 / self.loop.simulator.period_ns)):
             self._step()
 

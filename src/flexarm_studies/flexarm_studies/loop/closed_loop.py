@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop without ROS: the same objects that the nodes call, sample by sample; and the continuous loop."""
+"""Runs the loop without ROS, with the same objects that the nodes call, sample by sample; and the continuous loop."""
 
 from collections import deque
 
@@ -22,7 +22,7 @@ from flexarm_sim.simulator import Simulator
 
 from .metrics import Record, SimulatedRecord
 
-#: Where a recorded trajectory starts on the simulator's clock [ns]: the observer has converged by then.
+#: Start of a recorded trajectory on the simulator's clock [ns]: the observer has converged by then.
 TRAJECTORY_START_NS = Simulator.START_NS + 100_000_000
 
 
@@ -32,29 +32,29 @@ class ClosedLoop:
     Parameters
     ----------
     arm : str or Arm
-        Arm file of all three, shipped name or path; or what was read from one.
+        Arm file of all three, shipped name or path; or the `Arm` that was read from one.
     slow, fast, observer : mapping
         ``{"type": …, parameters…}``.
     simulator, controller : mapping, optional
-        Further parameters of the simulator and of the controller; without `feedforward` and the like in the
-        latter the design is the paper's, unchecked.
+        Further parameters of the simulator and of the controller; without `feedforward` and the like in the latter, the
+        design is that of the paper, unchecked.
     manifold : mapping, optional
-        ``{"type": …, parameters…}``; not given: the paper's.
+        ``{"type": …, parameters…}``; not given: that of the paper.
     plant_arm : Arm, optional
-        The simulated arm, when it is none of a file: see `arm.scaled`.
+        The simulated arm, if it does not come from a file: see `arm.scaled`.
     delay : float
-        How long after its measurement a torque begins to act [s]: whole periods and a part of one.
+        Time from a measurement until its torque begins to act [s]: whole periods and a part of one.
 
     Attributes
     ----------
     lost : str
         Why the last run of `follow` ended early; empty if it did not.
     unprepared : str
-        What its trajectory went without, preview for one, and why; empty: nothing that was asked for.
+        Requested features that its trajectory did not get, for example preview, and why; empty: it got all.
     bag : LoopBag or None
-        Where every sample and its answer are written.
+        Bag to which every sample and its answer are written.
     designed : Default or None
-        The design that the control is from; None: its parameters were given.
+        The design of the control; None: its parameters were given.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class ClosedLoop:
         self._on_the_way = deque([None] * (whole + 1))
 
     def measure(self):
-        """The present sample as `arm_state` has it."""
+        """The present sample in the form of `arm_state`."""
         s, sim = self._measured, self.simulator
         s.stamp_ns, s.session, s.sequence = sim.stamp_ns, 1, sim.sequence
         s.position[:] = sim.position
@@ -138,7 +138,7 @@ class ClosedLoop:
         return s
 
     def estimate(self, measured):
-        """The sample as `arm_state_estimate` has it; rates are None until the observer has converged."""
+        """The sample in the form of `arm_state_estimate`; rates are None until the observer has converged."""
         e, observer = self._estimate, self.observer
         converged = observer.step(measured)
         e.stamp_ns, e.session, e.sequence = measured.stamp_ns, measured.session, measured.sequence
@@ -150,26 +150,26 @@ class ClosedLoop:
         e.clock_stopped = measured.clock_stopped
         return e
 
-    #: The observer has this long to converge [s].
+    #: Max. time in which the observer must converge [s].
     MAX_START = 10.0
-    #: A longer delay is taken for a mistake [s].
+    #: A longer delay is refused as a mistake [s].
     MAX_DELAY = 1.0
-    #: The loop counts as lost when a joint is farther from its reference [rad].
+    #: The loop counts as lost when a joint is farther than this from its reference [rad].
     MAX_ERROR = 2.0 * np.pi
 
     def step(self):
-        """One sample: measure, estimate, control, and advance the plant; returns the torque sent or None."""
+        """One sample: measure, estimate, control, and advance the plant; returns the sent torque or None."""
         torque = self.controller.torque if self._answer() else None
         self._advance(torque)
         return torque
 
     def recorded_step(self):
-        """As `step`; the sample's stamp [ns] and a row for `record_of`.
+        """As `step`; returns the sample's stamp [ns] and a row for `record_of`.
 
         Raises
         ------
         ModelError
-            When the plant leaves what its model holds for.
+            If the plant leaves the range of its model.
         """
         enabled = self._answer()
         stamp, row = self.simulator.stamp_ns, self._row()
@@ -177,13 +177,13 @@ class ClosedLoop:
         return stamp, row
 
     def record_of(self, steps):
-        """A `SimulatedRecord` of what `recorded_step` gave, its time from the first on."""
+        """A `SimulatedRecord` of results of `recorded_step`; its time begins with the first."""
         stamps, rows = zip(*steps, strict=True)
         time = 1e-9 * (np.array(stamps) - stamps[0])
         return self._record(np.column_stack([time, rows]))
 
     def _answer(self):
-        """Measure, estimate, control: whether torque is enabled; a sample that was answered is answered alike."""
+        """Measure, estimate, control; return whether torque is enabled. A repeated sample gets the same answer."""
         return self._answer_to(self.measure())
 
     def _answer_to(self, measured):
@@ -199,7 +199,7 @@ class ClosedLoop:
         return enabled
 
     def _learn(self):
-        """What the controller node does once the torque is sent."""
+        """Do what the controller node does when the torque is sent."""
         controller = self.controller
         controller.learn()
         if (payload := controller.payload_wanted) is not None:
@@ -209,7 +209,7 @@ class ClosedLoop:
                 controller.payload.discard(str(error))
 
     def _advance(self, torque):
-        """One period of the plant under what has arrived by then."""
+        """Advance the plant by one period under the torques that have arrived by then."""
         way = self._on_the_way
         way.append(None if torque is None else torque.copy())
         before = way.popleft()
@@ -221,9 +221,9 @@ class ClosedLoop:
         Raises
         ------
         MessageError
-            When the trajectory is refused, or not followed to its end.
+            If the trajectory is refused, or not followed to its end.
         ModelError
-            When the plant leaves what its model holds for.
+            If the plant leaves the range of its model.
         """
         record = self.follow(trajectory, duration)
         if isinstance(self._failure, ModelError):
@@ -233,12 +233,12 @@ class ClosedLoop:
         return record
 
     def follow(self, trajectory, duration):
-        """As `run`, but a loop that loses the arm is a result, too: the record ends there, and `lost` says why.
+        """As `run`, but a loop that loses the arm is a result, too: the record ends there, and `lost` has the reason.
 
         Raises
         ------
         MessageError
-            When the trajectory is refused or does not start.
+            If the trajectory is refused or does not start.
         """
         self.lost, self._failure = "", None
         self._answer()
@@ -264,7 +264,7 @@ class ClosedLoop:
         return self._record(np.column_stack([time, rows]))
 
     def prepared(self, trajectory):
-        """What the feed-forward makes of the trajectory before it is offered; None where it can't."""
+        """What the feed-forward prepares for the trajectory before it is offered; None if it can't."""
         controller = self.controller
         self.unprepared = ""
         if controller.plans:
@@ -277,7 +277,7 @@ class ClosedLoop:
         return None
 
     def _moved(self, enabled):
-        """Advance the plant; False when it left what its model holds for."""
+        """Advance the plant; False if it left the range of its model."""
         try:
             self._advance(self.controller.torque if enabled else None)
         except ModelError as error:
@@ -285,7 +285,7 @@ class ClosedLoop:
         return self._failure is None
 
     def _why_lost(self):
-        """Why the arm does not follow the trajectory any more; empty if it does."""
+        """Why the arm no longer follows the trajectory; empty if it does."""
         controller, plant = self.controller, self.simulator.plant
         reference = controller.reference
         if controller.state in (State.INACTIVE, State.FAULT) or not (
@@ -301,7 +301,7 @@ class ClosedLoop:
         return ""
 
     def _row(self):
-        """What a `SimulatedRecord` holds of the sample that was just answered, time aside."""
+        """The row of a `SimulatedRecord` for the sample that was just answered, without the time."""
         controller, law = self.controller, self.controller.law
         estimate, plant = self._estimate, self.simulator.plant
         rate = np.full(self.model.n_modes, np.nan) if estimate.rate is None else estimate.rate
@@ -324,7 +324,7 @@ class ClosedLoop:
         )
 
     def _record(self, rows):
-        """Rows of time and what `_row` gives as a record."""
+        """A record from rows of time and results of `_row`."""
         n, m = self.model.n_joints, self.model.n_modes
         widths = [1, n, n, n, n, m, m, m, n, n, n, n, self.simulator.plant.delta.size, 1, 1]
         time, *vectors, saturated, state = np.split(rows, np.cumsum(widths)[:-1], axis=1)
@@ -360,16 +360,16 @@ class _ProfileReference:
 
 
 def continuous_loop(model, law, profile, times):
-    """The composite loop in continuous time, full state, error-controlled: what the paper simulates.
+    """The composite loop in continuous time, with full state and error control, as in the paper's simulations.
 
     Parameters
     ----------
     model : ArmModel
-        Plant and controller's model alike.
+        Both the plant and the controller's model.
     law : CompositeControl
     profile : Profile
     times : ndarray, shape (k,)
-        Of the record's samples, from 0 [s].
+        Times of the record's samples, from 0 [s].
     """
     n, m = model.n_joints, model.n_modes
     reference = _ProfileReference(profile)
@@ -378,7 +378,7 @@ def continuous_loop(model, law, profile, times):
         q, delta, qd, delta_d = np.split(state, [n, n + m, 2 * n + m])
         return law.step(q, qd, delta, delta_d, reference.at(t))
 
-    # The profile's jerk jumps at its end: integrate the two smooth pieces apart.
+    # The profile's jerk jumps at its end: integrate the two smooth pieces separately.
     end = profile.duration
     moving = np.union1d(times[times < end], end)
     resting = np.union1d(times[times > end], end)

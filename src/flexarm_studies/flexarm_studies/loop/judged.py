@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a closed loop bears, by the linear loop of its own observer and law: `flexarm analyze`, `flexarm simulate`."""
+"""Finds what a closed loop bears, by the linear loop of its observer and law: `flexarm analyze`, `flexarm simulate`."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 
 def judge_of(loop, places, delay):
-    """The `Judge` of a `ClosedLoop` at rest in the `places` (k, n) [rad], with a `delay` [s]; the loop is used up."""
+    """The `Judge` of a `ClosedLoop` at rest in the `places` (k, n) [rad], with a `delay` [s]; it uses the loop up."""
     source = Source(*loop.source)
     period, law = 1e-9 * loop.simulator.period_ns, loop.controller.law
     controllers = [linear_controller(law, loop.observer, q, period, source) for q in places]
@@ -18,7 +18,7 @@ def judge_of(loop, places, delay):
 
 
 def verdict_of(loop, places, delay) -> Verdict:
-    """The verdict on a loop, as `judge_of`; unknown where its observer or law can't be made linear."""
+    """The verdict on a loop, as `judge_of`; unknown if its observer or law can't be linearised."""
     try:
         return judge_of(loop, places, delay).verdict()
     except (FlexarmError, np.linalg.LinAlgError) as error:

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a run: tracking, vibration, torque; from recorded samples, without ROS.
+"""Computes the metrics of a run from recorded samples: tracking, vibration, torque; without ROS.
 
-The whole project has one definition of each of two numbers, and it is here:
+The whole project has one definition of each of these two numbers:
 
 peak error
-    `joint_error`'s largest value over a window: how far the joint is from its reference.
+    The largest value of `joint_error` over a window: how far the joint is from its reference.
 residual vibration
-    `residual_vibration` over `residual_window`: how much the tip still moves about its place of rest, by bending
-    alone, from one second after a motion on. The window is reported beside the number.
+    `residual_vibration` over `residual_window`: how much the tip still moves about its place of rest, by bending alone,
+    beginning one second after a motion. The window is reported beside the number.
 """
 
 from dataclasses import dataclass, fields
@@ -21,7 +21,7 @@ from flexarm_dynamics.arm.units import FOOT, POUND_FORCE, POUND_FORCE_FOOT
 
 @dataclass(frozen=True)
 class Record:
-    """Samples of a run, one row each; time zero is where the trajectory starts.
+    """Samples of a run, one per row; time zero is the start of the trajectory.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Record:
     torque: np.ndarray
 
     def thinned(self, every):
-        """The same with one row in `every`."""
+        """The same record with one row of `every`."""
         return type(self)(*(getattr(self, f.name)[::every] for f in fields(self)))
 
     def tip_deflection(self, model):
@@ -62,7 +62,7 @@ class Record:
         return length * np.cos(q) - y * np.sin(q), length * np.cos(self.reference[:, 0])
 
     def tip_x_rate(self, model):
-        """Its rate, (A10), actual and of the rigid arm on the reference, each (k,) [m/s]."""
+        """Rate of `tip_x`, (A10), actual and of the rigid arm on the reference, each (k,) [m/s]."""
         length, y = model.arm.links[0].length, self.tip_deflection(model)
         q, qd = self.position[:, 0], self.velocity[:, 0]
         actual = (-length * np.sin(q) - y * np.cos(q)) * qd
@@ -73,7 +73,7 @@ class Record:
 
 @dataclass(frozen=True)
 class SimulatedRecord(Record):
-    """A record with what the simulation alone knows.
+    """A record with values that only the simulation knows.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class SimulatedRecord(Record):
     saturated : ndarray of bool, shape (k,)
         Whether the torque was at a limit.
     state : ndarray of int, shape (k,)
-        The controller's state, as `Supervisor` numbers them.
+        The controller's state, as numbered by `Supervisor`.
     """
 
     plant_position: np.ndarray
@@ -98,9 +98,9 @@ def _phi_tip(model):
     return model.mode_shapes(model.arm.links[0].name, "y")(1.0)
 
 
-#: Residual vibration is judged from this long after the motion's end [s]: see `residual_window`.
+#: Time after the motion's end from which residual vibration is judged [s]: see `residual_window`.
 SETTLE = 1.0
-#: It is judged until this long after the motion's end at most [s].
+#: Time after the motion's end until which it is judged at most [s].
 MAX_REST = 6.0
 #: A window that waits for `SETTLE` is at least this long [s].
 MIN_WINDOW = 0.5
@@ -112,19 +112,19 @@ def joint_error(reference, position):
 
 
 def residual_window(rest, settle=SETTLE):
-    """When residual vibration is judged, for a rest of `rest` seconds after a motion.
+    """Window in which residual vibration is judged, for a rest of `rest` seconds after a motion.
 
-    Right after a motion the slow control is still removing its tracking error, and the torque that does so bends
-    the arm. That bending is no vibration, but an rms over the whole rest counts it: on the paper's arm it hides
-    that the composite control leaves twenty times less vibration than the slow control alone. The window therefore
-    starts one second after the motion: 2.5 time constants of the case study's slow poles. It ends six seconds
-    after the motion, so that runs of different length can be compared. For the case study's motion of 2 s this is
-    the window 3 to 8 s after the start.
+    Right after a motion the slow control is still removing its tracking error, and the torque for this bends the arm.
+    That bending is not vibration, but an rms over the whole rest includes it. On the paper's arm it hides that the
+    composite control leaves twenty times less vibration than the slow control alone. The window therefore starts one
+    second after the motion: 2.5 time constants of the case study's slow poles. It ends six seconds after the motion, so
+    runs of different length can be compared. For the case study's motion of 2 s this is the window 3 to 8 s after the
+    start.
 
-    A rest too short for that is judged from the motion's end: the number then contains the slow settling, and its
-    window says so.
+    A rest too short for that is judged from the motion's end: the number then contains the slow settling, as its window
+    shows.
 
-    Returns start and end, counted from the motion's end [s]; `settle` is the start where the rest is long enough [s].
+    Returns start and end, counted from the motion's end [s]; `settle` is the start if the rest is long enough [s].
     """
     end = min(rest, MAX_REST)
     return (settle if end >= settle + MIN_WINDOW - 1e-9 else 0.0), end
@@ -138,8 +138,8 @@ def residual_vibration(bending, at_rest=None):
     bending : ndarray, shape (k, ...)
         Displacement of the tip by the deflections, over a window of k samples [m].
     at_rest : array_like, optional
-        Its value at rest [m]. A simulation knows it: the static deflection of the plant. If not given it is the
-        mean over the window: on a real arm static errors of gauges and model would else count as vibration.
+        Its value at rest [m]. A simulation knows it: the static deflection of the plant. If not given, it is the mean
+        over the window: otherwise static errors of gauges and model would count as vibration on a real arm.
     """
     away = bending - (bending.mean(axis=0) if at_rest is None else at_rest)
     return float(np.sqrt(np.sum(away**2) / len(away)))
@@ -172,16 +172,16 @@ def case_study_metrics(record, model, settle=3.0, until=8.0):
 MIN_SETTLING = 0.05
 #: Static deflections are computed at this interval along the motion, and interpolated linearly between [s].
 SAG_INTERVAL = 0.01
-#: The final tip error is judged over this much of the record's end [s].
+#: Length of the record's end over which the final tip error is judged [s].
 FINAL = 0.5
 
 
 def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3, settle=SETTLE):
     """How well an arm followed a motion, and how it came to rest; for any number of joints and links.
 
-    The tip's error is its distance from the tip of the equivalent rigid arm at the reference. Under gravity the
-    arm sags even at rest: the errors `about_sag` are distances from the tip of the statically bent arm at the
-    reference instead, and settling is judged by them.
+    The tip's error is its distance from the tip of the equivalent rigid arm at the reference. Under gravity the arm
+    sags even at rest: the errors `about_sag` are therefore distances from the tip of the statically bent arm at the
+    reference, and settling is judged by them.
 
     Parameters
     ----------
@@ -189,29 +189,29 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
     model, plant_model : ArmModel
         The arm as the controller knows it, and as it is simulated.
     end : float
-        When the motion ends [s].
+        Time at which the motion ends [s].
     window : float
-        How long the arm rests after the motion [s].
+        Time for which the arm rests after the motion [s].
     tolerance : float
-        Of the tip, for the settling time [m].
+        Tolerance of the tip, for the settling time [m].
     settle : float
         Start of the residual vibration's window: see `residual_window` [s].
 
     Returns
     -------
     dict
-        Numbers, lists with one number per joint, and None for what the record does not reach: ready for JSON.
+        Numbers, lists with one number per joint, and None for what the record does not reach; ready for JSON.
 
         ``peak_joint_error_rad``, ``rms_joint_error_rad``
             `joint_error` to the true joint angle, of motor or link as its encoder measures it, per joint, from the
             motion's start to the record's end.
         ``peak_tip_error_mm``, ``rms_tip_error_mm``
-            Of the tip, as above; under gravity also ``…_about_sag_mm``, and ``static_sag_mm`` of the arm at rest
+            Error of the tip, as above; under gravity also ``…_about_sag_mm``, and ``static_sag_mm`` of the arm at rest
             at the motion's end.
         ``residual_tip_rms_mm``, ``residual_window_s``
             `residual_vibration` about the static deflection, and its window's start and end after the motion.
         ``final_tip_error_mm``
-            The tip's greatest error over the record's last `FINAL`: large where the loop oscillates, too.
+            The tip's largest error over the record's last `FINAL`: it is large also if the loop oscillates.
         ``settling_time_s``
             From the motion's end until the tip's error stays below the tolerance, at least `MIN_SETTLING`.
         ``peak_torque_Nm``, ``rms_torque_Nm``
@@ -219,10 +219,10 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
         ``saturation_share``
             Fraction of the samples with a torque at its limit.
         ``peak_deflection_mm``, ``case_study``
-            Of arms of one link in a plane: the tip's own deflection y, and `case_study_metrics` where the record
-            reaches its window.
+            For arms of one link in a plane: the tip's own deflection y, and `case_study_metrics` if the record reaches
+            its window.
     """
-    if record.time[-1] >= 0.0:  # else the arm was lost before the motion began
+    if record.time[-1] >= 0.0:  # otherwise the arm was lost before the motion began
         record = _from(record, 0.0)
     slack = encoder_rows(plant_model)[:, plant_model.n_joints :]
     error = joint_error(record.reference, record.plant_position + record.plant_amplitude @ slack.T)
@@ -275,7 +275,7 @@ def _tip_errors(unit, distance):
 
 
 def tip_path(model, position, amplitude):
-    """The tip for joint `position` (k, n) and modal `amplitude` (k, m), shape (k, 3) [m].
+    """Path of the tip for joint `position` (k, n) and modal `amplitude` (k, m), shape (k, 3) [m].
 
     Rows that repeat the one before are not computed again.
     """
@@ -318,7 +318,7 @@ def _residual(record, model, tip, end, span):
 
 
 def _settling_time(time, distance, end, tolerance):
-    """From the end until the tip stays within the tolerance [s]; None when it does not."""
+    """Time from the end until the tip stays within the tolerance [s]; None if it does not."""
     outside = np.flatnonzero((time >= end - 1e-9) & (distance > tolerance))
     if time[-1] < end - 1e-9 or (outside.size and outside[-1] == len(time) - 1):
         return None

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network that loses and delays samples between the arm and its control.
+"""Simulates a network that loses and delays samples between the arm and its control.
 
-Each sample of `arm_state` is lost with a given probability, independently of the others; else it arrives after
-``delay`` and a random time, uniform from 0 to ``jitter``. One that arrives after a newer one is dropped, as a DDS
-reader drops it. Observer and controller answer at arrival, as the nodes do, and the torque acts at once: a delay of
-the torque would have the same effect on the arm as a delay of the sample.
+Each sample of `arm_state` is lost with a given probability, independently of the others; otherwise it arrives after
+``delay`` and a random time, uniform from 0 to ``jitter``. A sample that arrives after a newer one is dropped, as by a
+DDS reader. Observer and controller answer at arrival, as the nodes do, and the torque acts at once: a delay of the
+torque would have the same effect on the arm as a delay of the sample.
 
 The driver's rules are those of `flexarm_ros.torque_gate`: a torque acts until the next one, but no longer than
 `TORQUE_TIMEOUT` after the sample that it answers; then each joint's safe action acts. As in its node, the
@@ -26,7 +26,7 @@ from .closed_loop import ClosedLoop
 TORQUE_TIMEOUT = 0.05
 #: The controller disables the torque after this long without a sample [s].
 STATE_TIMEOUT = 0.5
-#: From sending a trajectory to its start [s].
+#: Time from sending a trajectory to its start [s].
 LEAD = 0.1
 
 
@@ -36,7 +36,7 @@ class Network:
     A sample is lost with the probability `loss` [-]; it is late by `delay` and a time uniform from 0 to `jitter` [s].
     """
 
-    #: A longer delay than this is a wrong number [s].
+    #: A longer delay than this is refused as a mistake [s].
     MAX_TIME = 1.0
 
     def __init__(self, loss=0.0, delay=0.0, jitter=0.0, seed=0):
@@ -47,16 +47,16 @@ class Network:
                 limit = f"from 0 to {self.MAX_TIME:g} s"
                 raise FlexarmError(f"s is no usable {name}", field=name, value=value, limit=limit)
         self.loss, self.delay, self.jitter = loss, delay, jitter
-        # A stream of its own beside those of the sensors' noise.
+        # A separate stream, beside those of the sensors' noise.
         self._random = np.random.default_rng([seed, 2])
         self._on_the_way = []
         self._newest = -1
         self.sent = self.lost = self.dropped = 0
 
     def send(self, sample):
-        """A sample leaves the arm at its stamp."""
+        """Take a sample that leaves the arm at its stamp."""
         self.sent += 1
-        # Both are drawn for each sample: a longer delay does not change which ones are lost.
+        # Both are drawn for each sample, so a longer delay does not change which samples are lost.
         lost, late = self._random.random(2)
         if lost < self.loss:
             self.lost += 1
@@ -65,7 +65,7 @@ class Network:
         heappush(self._on_the_way, (arrival, sample.sequence, sample))
 
     def receive(self, until_ns):
-        """The next sample to arrive up to a time, and when; None when there is none."""
+        """The next sample to arrive up to a time, and its arrival time; None if there is none."""
         while self._on_the_way and self._on_the_way[0][0] <= until_ns:
             arrival, sequence, sample = heappop(self._on_the_way)
             if sequence > self._newest:
@@ -94,7 +94,7 @@ class NetworkedLoop(ClosedLoop):
     def follow(self, trajectory, duration):
         """As `ClosedLoop.follow`, from the first torque on: until then the controller knows no arm to move.
 
-        A trajectory with stamp 0 gets one by which it will be known, so that it starts with a sample of the arm.
+        A trajectory with stamp 0 gets a stamp by which it will be known, so it starts with a sample of the arm.
         """
         simulator = self.simulator
         latest = simulator.time + self.MAX_START
@@ -109,12 +109,12 @@ class NetworkedLoop(ClosedLoop):
         return super().follow(trajectory, duration)
 
     def _why_lost(self):
-        """As `ClosedLoop._why_lost`, but what the controller answers is older than the arm: it may not have begun."""
+        """As `ClosedLoop._why_lost`, but the controller's samples are older: the motion may not have begun."""
         waits = self.controller.enabled and self.controller.reference.pending
         return "" if waits else super()._why_lost()
 
     def _answer(self):
-        """Send the present sample and answer what has arrived by now; whether torque is enabled."""
+        """Send the present sample and answer those that have arrived by now; return whether torque is enabled."""
         simulator, now = self.simulator, self.simulator.stamp_ns
         if simulator.sequence != self._sent:
             self._sent = simulator.sequence
@@ -127,14 +127,14 @@ class NetworkedLoop(ClosedLoop):
         return self.controller.enabled
 
     def _take(self, now_ns, sample):
-        """Observer and controller on a sample that arrives; the driver on their torque."""
+        """Let observer and controller answer a sample that arrives, and the driver take their torque."""
         self._last_arrival_ns = now_ns
         enabled = self._answer_to(sample)
         self._torque = self.controller.torque.copy() if enabled else None
         self._until_ns = sample.stamp_ns + round(1e9 * TORQUE_TIMEOUT)
 
     def _advance(self, torque):
-        """One period of the plant; what arrives within it acts from then on."""
+        """Advance the plant by one period; a torque that arrives within it acts from its arrival on."""
         period = self.simulator.period_ns
         time = self.simulator.stamp_ns
         end, parts = time + period, []

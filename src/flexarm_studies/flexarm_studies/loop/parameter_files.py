@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS parameter files, read without ROS, so that the loop without ROS runs from the same file as the nodes."""
+"""Reads ROS parameter files without ROS, so the loop without ROS runs from the same file as the nodes."""
 
 from pathlib import Path
 
@@ -15,12 +15,12 @@ PREFIXES = {"controller": assembly.CONTROL, "observer": ("observer",), "simulato
 
 
 def directory():
-    """Where the shipped controller files are."""
+    """Folder of the shipped controller files."""
     return arms_directories()[0].parent / "controllers"
 
 
 def find(name):
-    """Path of a controller file, `name` being a path or a shipped name; an error lists the shipped ones."""
+    """Path of a controller file, from its path or shipped `name`; an error lists the shipped ones."""
     for path in (Path(name).expanduser(), directory() / f"{name}.yaml"):
         if path.is_file():
             return path
@@ -31,7 +31,7 @@ def find(name):
 
 
 def of_arm(arm):
-    """Path of the shipped controller file of an arm, by its name or path; None for one that gets a design instead."""
+    """Path of the shipped controller file of an arm, by its name or path; None if the arm gets a design instead."""
     if arm in PAPER_ARMS:
         return find("composite")
     shipped = directory() / f"{arm}.yaml"
@@ -39,7 +39,7 @@ def of_arm(arm):
 
 
 def load(name):
-    """Parameters of each node from a ROS parameter file, `name` being a path or a shipped name; wildcards are applied.
+    """Parameters of each node from a ROS parameter file, by its path or shipped `name`; wildcards are applied.
 
     Node name to flat parameters: ``{"controller": {"slow.kp": [6.25], …}, …}``.
     """
@@ -48,7 +48,7 @@ def load(name):
         data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
         sections = {key: assembly.flat(section["ros__parameters"]) for key, section in data.items()}
     except (yaml.YAMLError, OSError, ValueError, RecursionError) as error:
-        # ValueError: text that is no UTF-8, or a scalar that is not what it looks like, as a 13th month.
+        # ValueError: text that is not UTF-8, or a scalar that looks valid but is not, such as a 13th month.
         raise ParameterError(f"can't be read: {error}", field=str(path)) from None
     except (TypeError, KeyError, AttributeError, IndexError):
         hint = "write node name: ros__parameters: …"

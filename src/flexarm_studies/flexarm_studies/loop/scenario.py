@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of an arm under control, described by plain data: what `flexarm simulate --controller` runs.
+"""Describes and makes one run of an arm under control, from plain data, for `flexarm simulate --controller`.
 
-A scenario states the arm, the parameters of observer and controller, the motion, and how the simulated arm differs
-from the one that its controller knows. It can be written as JSON and sent to other processes; the same scenario
-gives the same samples, to the last bit.
+A scenario states the arm, the parameters of observer and controller, the motion, and how the simulated arm differs from
+the arm that its controller knows. It can be written as JSON and sent to other processes; the same scenario gives the
+same samples, to the last bit.
 """
 
 import difflib
@@ -33,7 +33,7 @@ from .network import Network, NetworkedLoop
 #: Parameters of the nodes themselves: they do not affect the loop.
 OF_NODES = ("arm", "autostart", "state_timeout", "lockstep", "use_sim_time")
 CONTROLLER = (*CONTROLLER_PARAMETERS, START_TOLERANCE, *DESIGN_PARAMETERS, *default.PARAMETERS)
-#: Fields of a scenario have these.
+#: Parameters that are fields of a scenario.
 OF_SCENARIOS = ("plant_arm", "plant_modes", "noise", "seed")
 
 
@@ -44,43 +44,43 @@ class Scenario:
     Attributes
     ----------
     arm : str or Arm
-        Arm file, as observer and controller know it: shipped name or path. An arm that was read goes to other
-        processes, too, but not through JSON.
+        Arm file, as observer and controller know it: shipped name or path. An `Arm` that was read can be sent to other
+        processes, but not through JSON.
     controller : dict
         Parameters of the loop by their names in a parameter file, flat: ``{"slow.type": "model_following",
         "slow.kp": [6.25], "observer.type": "luenberger", "torque_limit": [5.0], "rate": 500.0, …}``; see
-        `parameters`. Without laws they are those of a design for the arm, as in the nodes: `robust.default`.
+        `parameters`. Without laws, they are those of a design for the arm, as in the nodes: `robust.default`.
     trajectory : str or dict
         A motion in a line, such as ``paper`` or ``quintic:to=1.5,duration=2`` (`trajectory.specs`); a file, .csv or
         .yaml (`trajectory.files`); or a mapping with ``times`` [s], ``positions`` [rad] and, if wanted,
-        ``velocities`` and ``accelerations``. The arm starts where it does, unless `controller` has an
+        ``velocities`` and ``accelerations``. The arm starts where the motion starts, unless `controller` has an
         ``initial_position``.
     payload_scale, stiffness_scale, damping_scale : float
-        Of the simulated arm alone, see `arm.scaled` [-].
+        Factors of the simulated arm alone, see `arm.scaled` [-].
     plant_arm : str or Arm
-        Arm file of the simulated arm, where it is another; scaled as well.
+        Arm file of the simulated arm, if it is another one; it is scaled as well.
     plant_modes : int
         Modes per flexible direction of the simulated arm; 0: as in its file.
     noise : bool
         Whether sensors have the noise that the arm file states.
     seed : int
-        Of the noise, and of what the network does.
+        Seed of the noise, and of the network's losses and delays.
     rate : float or None
-        Samples per second; None: as in `controller`, else 1000 [Hz].
+        Samples per second; None: as in `controller`, otherwise 1000 [Hz].
     delay : float
         From a measurement until its torque begins to act [s].
     loss : float
-        Probability that a sample is lost on its way to the observer, each on its own [-]; see `network`.
+        Probability that a sample is lost on its way to the observer, independently of others [-]; see `network`.
     jitter : float
-        Every sample is later still by a time uniform from 0 to this [s].
+        Every sample is delayed further, by a time uniform from 0 to this [s].
     duration : float or None
-        From the motion's start; None: to the end of the `window` [s].
+        Duration from the motion's start; None: to the end of the `window` [s].
     window : float
-        Over how long after the motion the rest is judged [s].
+        Time after the motion over which the rest is judged [s].
     tolerance : float
-        Of the tip, for the settling time [m].
+        Tolerance of the tip, for the settling time [m].
     repeat : int
-        Number of times that the motion is run, for laws that learn; in between the arm returns the same way.
+        Number of times that the motion is run, for laws that learn; in between the arm returns on the same path.
     """
 
     arm: str
@@ -103,7 +103,7 @@ class Scenario:
     repeat: int = 1
 
     def as_dict(self):
-        """The fields, ready for JSON; ``Scenario(**fields)`` is the same again."""
+        """The fields, ready for JSON; ``Scenario(**fields)`` gives the same scenario."""
         return asdict(self)
 
 
@@ -113,13 +113,13 @@ def parameters(file, settings=(), arm=""):
     Parameters
     ----------
     file : str or Path or None
-        Parameter file of the nodes: shipped name or path. Each parameter is taken from the section of the node
-        that it belongs to. None: the settings alone.
+        Parameter file of the nodes: shipped name or path. Each parameter is taken from the section of its node. None:
+        only the settings.
     settings : sequence of str
         ``name=value`` each, the value as YAML, as `ros2 param set` takes it; for a float or an array of them also
         plain numbers: ``slow.kp=9``, one for all joints, or ``slow.kp=9,4``.
     arm : str
-        Arm file: without laws the settings are about those of a design for it.
+        Arm file: without laws, the settings change those of a design for it.
 
     Returns
     -------
@@ -128,13 +128,13 @@ def parameters(file, settings=(), arm=""):
     Raises
     ------
     ParameterError
-        For a file that can't be read, and for a setting that is no parameter of the components chosen.
+        For a file that can't be read, and for a setting that is not a parameter of the chosen components.
     """
     nodes = {} if file is None else parameter_files.load(file)
     nodes = {node: nodes.get(node, {}) for node in parameter_files.PREFIXES}
     of_simulator = {p.name for p in SIMULATOR_PARAMETERS}
     found = {k: v for k, v in nodes["controller"].items() if k in {p.name for p in CONTROLLER}}
-    # The rate is the simulator's; the controller's parameter of that name is for other sources.
+    # The rate is that of the simulator; the controller's parameter of the same name is for other sources.
     found |= {k: v for k, v in nodes["simulator"].items() if k in of_simulator}
     for node in ("observer", "controller"):
         own = parameter_files.PREFIXES[node]
@@ -149,7 +149,7 @@ def parameters(file, settings=(), arm=""):
 
 
 def _with_types(arm, values):
-    """Flat parameters with the laws of a design where one is to be made."""
+    """Flat parameters, with the laws of a design if one is to be made."""
     kind = values.get("design.type", default.AUTO)
     return default.TYPES | values if default.is_wanted(arm, values, kind) else values
 
@@ -198,7 +198,7 @@ def _parameter(name, values):
 
 
 def design_task(scenario):
-    """What the control of a scenario is designed for, see `default.wanted_task`; None where it needs no design."""
+    """Task for which the control of a scenario is designed, see `default.wanted_task`; None without a design."""
     return default.wanted_task(_name(scenario.arm), _read(scenario.arm), _given(scenario))
 
 
@@ -210,7 +210,7 @@ def _given(scenario):
 
 
 def loop_of(scenario):
-    """The scenario's `ClosedLoop`, before its first sample; `designed` is the `Default` that was made for it, or None.
+    """The scenario's `ClosedLoop` before its first sample; `designed` is the `Default` made for it, or None.
 
     A design that is not in the cache takes seconds to minutes.
     """
@@ -254,7 +254,7 @@ def _read(arm):
 
 
 def _name(arm):
-    """How an arm was given: by this name or path; empty for one that was read."""
+    """Name or path by which an arm was given; empty for an `Arm` that was read."""
     return "" if isinstance(arm, Arm) else arm
 
 
@@ -264,25 +264,25 @@ def run(scenario):
     Returns
     -------
     record : SimulatedRecord
-        Of the last time the motion was carried out.
+        Record of the last run of the motion.
     metrics : dict
         Of that record, ready for JSON: those of `tracking_metrics`, and
 
         ``lost``, ``reason``
-            Whether the loop lost the arm (torque disabled, motion given up, arm bent or turned beyond all sense,
-            numbers no longer finite), and why; the record then ends there.
+            Whether the loop lost the arm (torque disabled, motion given up, arm bent or turned too far, numbers no
+            longer finite), and why; the record then ends there.
         ``state``
-            Of the controller's supervisor at the end.
+            State of the controller's supervisor at the end.
         ``motion_s``, ``simulated_s``
-            Until the reference's end, and until the record's.
+            Time until the reference's end, and until the record's end.
         ``passes``
-            With `repeat` above 1: the metrics of each time.
+            With `repeat` above 1: the metrics of each run of the motion.
 
     Raises
     ------
     FlexarmError
         For a scenario that can't be run: an arm, a parameter, a `repeat`, a design or a trajectory that is refused,
-        or an observer that does not converge. A loop that loses its arm is no error.
+        or an observer that does not converge. A loop that loses its arm is not an error.
     """
     return run_loop(scenario)[:2]
 
@@ -290,8 +290,8 @@ def run(scenario):
 def run_loop(scenario, recorder=None):
     """As `run`, and the `ClosedLoop` in which it ran.
 
-    A `recorder` is called with the loop, the arm file's name and the observer's name, and returns a context that
-    records the run: ``functools.partial(flexarm_tools.recording.loop_bag.LoopBag, folder)``.
+    A `recorder` is called with the loop, the arm file's name and the observer's name, and returns a context manager
+    that records the run: ``functools.partial(flexarm_tools.recording.loop_bag.LoopBag, folder)``.
     """
     if not (isinstance(scenario.repeat, int) and scenario.repeat >= 1):
         raise ParameterError(
@@ -307,14 +307,14 @@ def run_loop(scenario, recorder=None):
     _check_times(scenario, duration)
     if recorder is None:
         return _passes(scenario, loop, motion, back, end, duration)
-    # An `Arm` that was read has no file any more.
+    # An `Arm` that was read no longer has a file.
     arm = scenario.arm if isinstance(scenario.arm, str) else ""
     with recorder(loop, arm, type_of("observer", scenario.controller)):
         return _passes(scenario, loop, motion, back, end, duration)
 
 
 def _passes(scenario, loop, motion, back, end, duration):
-    """Carry the motion out as often as it is wanted; as `run_loop`."""
+    """Run the motion as often as wanted; as `run_loop`."""
     passes = []
     for i in range(scenario.repeat):
         if i and back is not None and not loop.lost:
@@ -346,7 +346,7 @@ def _metrics(scenario, loop, record, end, duration):
     }
     window = min(scenario.window, max(duration - end, 0.0))
     plant = loop.simulator.plant_model
-    # An arm that was lost may be anywhere: squares of its numbers need not be finite.
+    # A lost arm may be anywhere: squares of its numbers need not be finite.
     with np.errstate(over="ignore", invalid="ignore"):
         found |= tracking_metrics(record, loop.model, plant, end, window, scenario.tolerance)
     return found
@@ -377,7 +377,7 @@ def _points(given):
 
 
 def _returning(motion, start):
-    """The way back, None where a motion ends at its start."""
+    """The motion back; None if a motion ends at its start."""
     if np.abs(motion.positions[-1] - start).max() < 1e-9:
         return None
     last = int(motion.times_ns[-1])

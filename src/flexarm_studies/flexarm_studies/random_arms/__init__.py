@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random arms: a seeded generator, trials on plants that are not the model, and the table of both."""
+"""Random arms: generates them from a seed, tries controllers on plants that are not the model, and makes the table."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm arms``: random arms under several controllers, on plants that are not their models."""
+"""``flexarm arms``: runs random arms under several controllers, on plants that are not their models."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from ..uncertain.controllers import CONTROLLERS
 from ..uncertain.plants import VARIANTS
 from . import generator, report, study
 
-#: Controllers and plants of the table, unless others are asked for.
+#: Controllers and plants of the table, unless others are requested.
 USUAL = ("default", "preview", "designed", "designed_preview", "pid_zvd", "pid_ei", "lqr")
 PLANTS = (
     "exact",

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Random arms: what a user may bring, described as in an arm file, each with a motion.
+r"""Generates random arms as a user may have them, described as in an arm file, each with a motion.
 
 Arm i of a seed is drawn from ``SeedSequence(seed, spawn_key=(i,))`` alone: the first ten of a hundred are those of ten.
-Layouts take turns: 1 to 4 links, planar (all axes along z) and spatial (yaw, then pitch; links bend both ways), each
+The layouts alternate: 1 to 4 links, planar (all axes along z) and spatial (yaw, then pitch; links bend both ways), each
 with and without gravity. The rest is drawn: reach, links of strip or tube in aluminium, steel or CFRP, payload, hubs,
 gears, motors at the elbows, friction, damping, sensors. A draw whose first frequency with joints locked is outside
-`FREQUENCIES`, that sags by more than `MAX_SAG`, or whose links are strained beyond what their material bears, is
-replaced by the next draw.
+`FREQUENCIES`, that sags by more than `MAX_SAG`, or whose links have more strain than their material bears, is replaced
+by the next draw.
 
 The motion turns every joint by 60 to 90 degrees in two periods of the lowest mode with joints locked (quintic). The
 torque limits are 1.5 to 2 times what the rigid arm needs for it, weight and friction included.
@@ -31,13 +31,13 @@ LAYOUTS = tuple((kind, count) for count in (1, 2, 3, 4) for kind in ("planar", "
 FREQUENCIES = (0.5, 15.0)
 #: Whole length [m], mass of the payload as a multiple of the links' [-], modal damping ratio [-].
 REACH, PAYLOAD, DAMPING = (0.3, 3.0), (0.01, 2.0), (0.001, 0.01)
-#: Angle that every joint turns by [rad], in so many locked periods.
+#: Angle by which every joint turns [rad], and duration in locked periods.
 ANGLE, PERIODS = (np.pi / 3.0, np.pi / 2.0), 2.0
 #: Torque limit as a multiple of what the motion needs, and limit of the speed as a multiple of the motion's.
 TORQUE, SPEED = (1.5, 2.0), (1.5, 2.5)
 #: Largest deflection of the tip as a fraction of the reach: at rest under gravity, and moving slowly [-].
 MAX_SAG, MAX_BENDING = 0.1, 0.2
-#: More modes than this: one per direction in place of two.
+#: With more modes than this, each direction has one mode in place of two.
 MAX_MODES = 8
 #: A generator that redraws more often than this has a mistake.
 MAX_DRAWS = 2000
@@ -70,9 +70,9 @@ class RandomArm:
     arm : dict
         As in an arm file: plain data.
     motion : str
-        In a line, as `trajectory.specs` reads it.
+        Motion as one line, as `trajectory.specs` reads it.
     period : float
-        Of the lowest mode with joints locked, the longer one of both ends of the motion [s].
+        Period of the lowest mode with joints locked, the longer of those at the two ends of the motion [s].
     """
 
     name: str
@@ -149,7 +149,7 @@ def _log(rng, low, high):
 
 
 def _short(value):
-    """A number with five digits, as a person writes it."""
+    """A number with five digits, written as by a person."""
     return float(f"{value:.5g}")
 
 
@@ -221,7 +221,7 @@ def _mass(link):
 
 
 def _thickness(section, direction):
-    """Of a section in the direction in which it bends [m]."""
+    """Thickness of a section in the direction in which it bends [m]."""
     return section["outer_diameter"] if section["shape"] == "tube" else section[f"size_{direction}"]
 
 
@@ -241,7 +241,7 @@ def _outboard(links, motors, payload):
 
 
 def _joint(rng, kind, number, inertia, motor, geared, heavy):
-    """A joint as in an arm file, still without friction and limits; its hub is light, heavy, or a gear's."""
+    """A joint as in an arm file, still without friction and limits; its hub is light, heavy, or that of a gear."""
     axis = [0, 0, 1] if kind == "planar" or number == 0 else [0, 1, 0]
     hub = _log(rng, 0.01, 0.1) if geared or rng.random() < 0.5 else _log(rng, 0.1, 3.0)
     joint = {"name": f"joint{number + 1}", "axis": axis, "hub_inertia": _short(hub * inertia)}
@@ -286,7 +286,7 @@ def _with_motion(rng, data, material, geared):
 
 
 def _limit(rng, data, plain, profile, geared):
-    """Give the joints friction, and limits that the motion keeps."""
+    """Give the joints friction, and limits within which the motion stays."""
     times = np.linspace(0.0, profile.duration, 61)
     q, qd, qdd = (np.array([profile.derivative(k, t) for t in times]) for k in range(3))
     load = np.array([_rigid_torque(plain, *x) for x in zip(q, qd, qdd, strict=True)])
@@ -313,7 +313,7 @@ def _rigid_torque(plain, q, qd, qdd):
 
 
 def _add_gauges(rng, data):
-    """As many gauges as modes, on every link in every direction, at the root and where the second mode bends."""
+    """Add as many gauges as modes, on every link in every direction, at the root and where the second mode bends."""
     noise, bits = _short(_log(rng, 3e-7, 2e-6)), int(rng.choice([14, 16]))
     data["gauges"] = [
         {
@@ -333,9 +333,9 @@ def _add_gauges(rng, data):
 
 
 def _peak_strain(whole, profile):
-    """Largest strain of each gauge when the arm follows its motion as if it had no inertia of bending, (gauges,) [-].
+    """Largest strain of each gauge when the arm follows its motion without inertia of the bending, (gauges,) [-].
 
-    None where the arm bends too far, at rest or in motion.
+    None if the arm bends too far, at rest or in motion.
     """
     rows, n = gauge_rows(whole, whole.arm.gauges), whole.n_joints
     reach = whole.arm.reach

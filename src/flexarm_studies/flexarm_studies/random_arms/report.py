@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of random arms, for the terminal and for docs/random_arms.md, and why arms were refused or lost."""
+"""Writes the table of random arms for the terminal and for docs/random_arms.md, and why arms were refused or lost."""
 
 import re
 from collections import Counter
@@ -41,19 +41,20 @@ LOUDER = (
     "arm", "design", "noisy", "noise alone", "exact", "held", "lowest mode that torque reaches [Hz]",
     "that no torque reaches [Hz]",
 )  # fmt: skip
-#: Least decay that is wanted of every design, over the first locked frequency [-].
+#: Minimum decay that is wanted of every design, over the first locked frequency [-].
 LEAST = 0.05
 #: Settling times closer than this are equal [s].
 EQUAL = 0.01
-#: Settled in time: locked periods after the motion [-].
+#: Max. locked periods after the motion to count as settled in time [-].
 IN_TIME = 3.0
-#: Plants that differ from the file by what a design is for.
+#: Plants with deviations for which a design is made.
 UNSURE = ("payload x0.7", "payload x1.3", "stiffness x0.9", "stiffness x1.1")
-#: On the exact plant a design settles within [s], and within so many locked periods [-].
+#: Time [s], and locked periods [-], within which a design should settle on the exact plant.
 AT_ONCE, SOON = 0.1, 0.5
-#: A residual of less, as a fraction of the reach, is none; one with noise may be so many times what noise alone makes.
+#: A smaller residual, as a fraction of the reach, counts as none; max. ratio of a residual with noise to that of noise
+#: alone.
 STILL, NOISE = 1e-6, 3.0
-#: So many reasons are listed per controller.
+#: Number of reasons that are listed per controller.
 REASONS = 6
 
 
@@ -74,7 +75,7 @@ def rows_of(rows):
 
 
 def best_baseline(rows):
-    """Shortest settling time of the baselines, by arm and variant [s]; infinite where none settles."""
+    """Shortest settling time of the baselines, by arm and variant [s]; infinite if none settles."""
     best = {}
     for row in rows:
         if row["controller"] in BASELINES:
@@ -130,8 +131,8 @@ def _periods(row):
 def missed(rows):
     """Cells of the table of the designs in `rows` that did not settle in time everywhere, per arm and controller.
 
-    Of each variant the locked periods until settled; behind them the largest joint error at rest, where it is more than
-    is wanted.
+    For each variant: the locked periods until settled, followed by the largest joint error at rest if that is more than
+    wanted.
     """
     designed = {row["controller"] for row in rows if "decay" in row}
     groups = {}
@@ -144,12 +145,12 @@ def missed(rows):
 
 
 def loud(rows, seed):
-    """Cells of the table of the designs in `rows` that vibrate more with noise than is wanted, and what limits them.
+    """Cells of the table of the designs in `rows` that vibrate more with noise than wanted, and what limits them.
 
     Returns
     -------
     iterator of tuple
-        Of `LOUDER`.
+        Cells of the columns `LOUDER`.
     """
     exact = {
         (row["number"], row["controller"]): row.get("residual_tip")
@@ -172,7 +173,7 @@ def loud(rows, seed):
 
 
 def _quiet(row):
-    """Whether a run with noise vibrates at most `NOISE` times as much as noise alone makes the arm, or not at all."""
+    """Whether a run with noise vibrates at most `NOISE` times as much as with noise alone, or not at all."""
     found, alone = row.get("residual_tip"), row.get("noise_tip")
     return None not in (found, alone) and found <= max(NOISE * alone, STILL)
 
@@ -185,7 +186,7 @@ def _in_words(row):
 
 
 def reached(rows):
-    """Cells of the table of what is wanted of designs: the line, what is wanted, and what each design reached.
+    """Cells of the table of requirements on designs: the line, what is wanted, and what each design reached.
 
     Returns
     -------
@@ -259,7 +260,7 @@ def reached(rows):
 
 
 def _smallest_residual(rows):
-    """Of the baselines that settle the soonest, by arm and variant, as a fraction of the reach [-]."""
+    """Residual of the baselines that settle the soonest, by arm and variant, as a fraction of the reach [-]."""
     best, found = best_baseline(rows), {}
     for row in rows:
         place = row["number"], row["variant"]
@@ -269,7 +270,7 @@ def _smallest_residual(rows):
 
 
 def _share(right):
-    """How many of all, in words; None of none."""
+    """Count of true values among all, in words; None if there are none."""
     if not right:
         return None
     count = sum(map(bool, right))
@@ -277,7 +278,7 @@ def _share(right):
 
 
 def reasons(rows):
-    """Lines: why arms were refused or lost, by controller, the commonest first; numbers and names left out."""
+    """Lines: why arms were refused or lost, by controller, the most common first; without numbers and names."""
     lines = []
     for controller in dict.fromkeys(row["controller"] for row in rows):
         own = [row for row in rows if row["controller"] == controller and outcome(row) != "works"]
@@ -295,7 +296,7 @@ def _gist(reason):
 
 
 def decays(rows):
-    """Cells of the table of designs, a row per controller that is one: the worst-case decay of its arms."""
+    """Cells of the table of designs, a row per controller that is a design: the worst-case decay of its arms."""
     found = {}
     for row in rows:
         if "decay" in row:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many random arms under many controllers: every run a line of a file, and none is run twice.
+"""Runs many random arms under many controllers; every run is a line of a file, and none is run twice.
 
-A run is known by the arm's number, the controller and the variant; with the seed these decide its result, whatever the
-number of workers. The file's first line holds the seed. Results of changed code need a new file: nothing notices that a
-line is older than the code.
+A run is identified by the arm's number, the controller and the variant. With the seed these determine its result,
+whatever the number of workers. The file's first line contains the seed. Results of changed code need a new file:
+nothing detects that a line is older than the code.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from . import generator
 
 @dataclass(frozen=True)
 class Specification:
-    """What all runs of a file have in common."""
+    """Settings that all runs of a file have in common."""
 
     random_arms_seed: int = 0
 
@@ -57,7 +57,8 @@ def run(
         Rows by arm, controller and variant.
     """
     keep, jobs = Store(path, Specification(seed)), []
-    # All arms under one controller, then under the next: the second one of an arm finds the first one's design.
+    # All arms under one controller, then under the next: so the second controller of an arm finds the design of the
+    # first.
     for controller in controllers:
         for number in numbers:
             left = [v for v in variants if key(number, controller, v) not in keep.results]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings from anywhere: what the columns of a file are, and what a recording shows."""
+"""Handles recordings from any source: the meaning of a file's columns, and what a recording shows."""

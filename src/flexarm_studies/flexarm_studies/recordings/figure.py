@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A figure of what a recording shows: its channels over time, spectra, noise, ring-downs."""
+"""Draws what a recording shows: its channels over time, spectra, noise, ring-downs."""
 
 import numpy as np
 
@@ -14,12 +14,12 @@ OVER_TIME = ("position", "velocity", "torque", "current", "strain", "amplitude")
 
 
 def draw(recording, found, path):
-    """Draw a recording and the summary `found` of it; the path.
+    """Draw a recording and the summary `found` of it; return the path.
 
     Raises
     ------
     FlexarmError
-        For a path that is no picture's.
+        For a path that is not that of a picture.
     """
     path = check_file(path)
     rows = [q for q in OVER_TIME if any(quantity == q for quantity, *_ in channels(recording))]

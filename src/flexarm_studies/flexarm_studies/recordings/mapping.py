@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the columns of a CSV file are: a mapping file says it, or the names in the file's first line.
+"""Determines what the columns of a CSV file are, from a mapping file or from the names in the file's first line.
 
 A mapping file (YAML; ``config/recordings/tudor.yaml`` is a commented one)::
 
@@ -10,9 +10,9 @@ A mapping file (YAML; ``config/recordings/tudor.yaml`` is a commented one)::
     held:
     - {joint: base, position: 0.0, unit: rad}
 
-A column is meant by its number, from 1, or by its name in the first line; columns that are not listed are ignored. A
-value in SI is the cell times the unit, times ``factor`` and ``sign`` (1 where not given). ``rate`` [Hz] stands in for a
-column of time. ``delimiter``, ``decimal`` and ``header`` are needed only where the file leaves them open.
+A column is given by its number, from 1, or by its name in the first line; columns that are not listed are ignored. A
+value in SI is the cell times the unit, times ``factor`` and ``sign`` (1 where not given). ``rate`` [Hz] replaces a
+column of time. ``delimiter``, ``decimal`` and ``header`` are needed only if the file does not make them clear.
 
 Without a mapping file the first line has the names: ``t``, ``<joint>_position``, ``<gauge>_strain`` and so on, in SI.
 """
@@ -30,7 +30,7 @@ from ..tables import TableError
 
 ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180.0, "turn": 2.0 * np.pi}
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-#: Quantity to what it belongs to, and its units, each with the factor to SI.
+#: Quantity to the kind of thing it belongs to, and its units, each with the factor to SI.
 QUANTITIES = {
     "time": ("", TIME),
     "position": ("joint", ANGLE),
@@ -43,7 +43,7 @@ QUANTITIES = {
     "strain": ("gauge", {"strain": 1.0, "millistrain": 1e-3, "microstrain": 1e-6}),
     "amplitude": ("mode", {"m": 1.0, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3}),
 }
-#: To what a quantity may belong.
+#: Kinds of things to which a quantity may belong.
 KINDS = ("joint", "gauge", "mode", "imu")
 DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 
@@ -61,7 +61,7 @@ class Column:
     of : str
         Joint, gauge, mode, or axis of an IMU; empty for the time.
     factor : float
-        From the cell to SI, the sign in it.
+        Factor from the cell to SI, including the sign.
     """
 
     at: int | str
@@ -71,7 +71,7 @@ class Column:
 
     @property
     def name(self):
-        """For messages."""
+        """Its name in messages."""
         return f"{self.quantity} of {self.of}" if self.of else self.quantity
 
 
@@ -83,11 +83,11 @@ class Mapping:
     ----------
     columns : tuple of Column
     held : dict
-        Joint that is not recorded, since it stands still, to its angle [rad].
+        Joint that is not recorded, because it stands still, to its angle [rad].
     rate : float or None
-        Rows per second where no column is the time [Hz].
+        Rows per second if no column is the time [Hz].
     header : bool or None
-        Whether the first line has names; None: it has if a cell of it is no number.
+        Whether the first line has names; None: it has names if a cell of it is not a number.
     delimiter : str or None
         Between cells; None: found in the first line.
     decimal : str
@@ -102,18 +102,18 @@ class Mapping:
     decimal: str = "."
 
     def names(self, kind):
-        """Names of what is of a `kind` (of `KINDS`), in the file's order, held joints last."""
+        """Names of all things of a `kind` (of `KINDS`), in the file's order, held joints last."""
         found = [c.of for c in self.columns if QUANTITIES[c.quantity][0] == kind]
         return tuple(dict.fromkeys([*found, *(self.held if kind == "joint" else ())]))
 
 
 def directory():
-    """Where the shipped mapping files are."""
+    """Folder of the shipped mapping files."""
     return arms_directories()[0].parent / "recordings"
 
 
 def load(name):
-    """Read a mapping file, `name` being a path or a shipped name.
+    """Read a mapping file, by its path or shipped `name`.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def _sign(entry):
 
 
 def _parts(title):
-    """Name and quantity of a column; both empty where it is none."""
+    """Name and quantity of a column; both are empty if it is not a column that is known."""
     for quantity in sorted(QUANTITIES, key=len, reverse=True):
         if title.endswith(f"_{quantity}"):
             return title[: -len(quantity) - 1], quantity
@@ -225,7 +225,7 @@ def _parts(title):
 
 
 def names_in(arm, kind):
-    """Names of what an arm has of a `kind`; None without an `arm`, and for what is in no arm file."""
+    """Names of all things of a `kind` in an arm; None without an `arm`, and for kinds that arm files do not have."""
     return getattr(arm, f"{kind}_names", None)
 
 
@@ -236,7 +236,7 @@ def by_names(header, arm=None):
     ----------
     header : sequence of str
     arm : Arm, optional
-        Whose joints, gauges and modes are wanted; others are then ignored.
+        Only its joints, gauges and modes are wanted; others are ignored.
     """
     wanted = {kind: names_in(arm, kind) for kind in KINDS}
     columns = [Column("t", "time")]
@@ -259,5 +259,5 @@ def add_option(parser):
 
 
 def of_options(options):
-    """The `Mapping` that ``--mapping`` asks for; None without."""
+    """The `Mapping` of ``--mapping``; None without this option."""
     return None if options.mapping is None else load(options.mapping)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joint motion of a recording as a smooth function of time: angle, speed and acceleration that belong together."""
+"""Makes the joint motion of a recording a smooth function of time, with consistent angle, speed and acceleration."""
 
 import numpy as np
 
@@ -9,26 +9,26 @@ from ..tables import Motion
 
 #: Corner of the low pass of the measured angles [Hz]: joints hardly move faster, and encoders' steps are noise above.
 CORNER = 20.0
-#: A corner above this fraction of the rate smooths nothing [-].
+#: A corner above this fraction of the rate does not smooth anything [-].
 PASSES_ALL = 0.4
 
 
 def motion_of(recording, corner=CORNER):
     """The measured joint motion, without phase: a low pass forwards and backwards, then a spline of degree five.
 
-    Speed and acceleration are the spline's derivatives, so that all three are of one motion; recorded speeds and
-    accelerations, which are filtered each in its own way, are not used.
+    Speed and acceleration are the spline's derivatives, so all three belong to one motion. Recorded speeds and
+    accelerations are not used, because each of them is filtered in a different way.
 
     Parameters
     ----------
     recording : Recording
     corner : float
-        Of the low pass, a Butterworth filter of order two, passed twice [Hz].
+        Corner of the low pass, a Butterworth filter of order two that is passed twice [Hz].
 
     Returns
     -------
     Motion
-        Of the time as the recording counts it.
+        A function of the time as the recording counts it.
 
     Raises
     ------
@@ -40,9 +40,9 @@ def motion_of(recording, corner=CORNER):
 
 
 def low_passed(recording, corner=CORNER):
-    """The measured joint angles without what is above a `corner` [Hz], without phase, shape (s, n) [rad].
+    """The measured joint angles without the part above a `corner` [Hz], without phase, shape (s, n) [rad].
 
-    A Butterworth filter of order two, passed forwards and backwards. `recording` is a `Recording`.
+    The filter is a Butterworth filter of order two, passed forwards and backwards. `recording` is a `Recording`.
 
     Raises
     ------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the joints of a recording stand still, and what its gauges read there: noise, and its common part."""
+"""Finds where the joints of a recording stand still, and the noise of its gauges there, with its common part."""
 
 from dataclasses import dataclass
 
@@ -7,18 +7,18 @@ import numpy as np
 
 #: Corner of the low pass before speeds are taken from angles [Hz], at most this fraction of the rate.
 CORNER, OF_RATE = 10.0, 0.2
-#: A joint stands below this fraction of its speed, which is its 99th percentile [-] ...
+#: A joint stands if it is slower than this fraction of the 99th percentile of its speed [-] ...
 SLOW = 0.05
-#: ... or below so many steps of its encoder per second.
+#: ... or slower than this number of steps of its encoder per second.
 STEPS = 10.0
 #: Order of the autoregression of the noise that gauges share.
 MEMORY = 4
-#: A shorter stretch is none of rest [s].
+#: A shorter stretch does not count as rest [s].
 MIN_REST = 0.6
 
 
 def low_passed(values, period, corner):
-    """The columns of `values` (s, k) without what is above a `corner` [Hz], without phase; `period` is of a row [s]."""
+    """The columns of `values` (s, k) below a `corner` [Hz], without phase; `period` is between rows [s]."""
     from scipy.signal import butter, sosfiltfilt
 
     corner = min(corner, OF_RATE / period)
@@ -26,12 +26,12 @@ def low_passed(values, period, corner):
 
 
 def derivative(values, period):
-    """Rates of the columns of `values` (s, k) by central differences, shape (s, k); `period` is of a row [s]."""
+    """Rates of the columns of `values` (s, k) by central differences, shape (s, k); `period` is between rows [s]."""
     return np.gradient(values, period, axis=0)
 
 
 def step_of(values):
-    """Smallest change from one row to the next of `values` (s,), the step of an encoder or converter; 0 without."""
+    """Smallest change between successive rows of `values` (s,), the step of an encoder or converter; 0 without one."""
     change = np.abs(np.diff(values))
     change = change[change > 1e-9 * np.abs(values).max(initial=0.0)]
     return float(change.min()) if change.size else 0.0
@@ -56,7 +56,7 @@ def stretches(recording):
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """What the gauges read while nothing moves.
+    """Readings of the gauges while nothing moves.
 
     Attributes
     ----------
@@ -67,9 +67,9 @@ class Noise:
     correlation : ndarray, shape (g, g)
         Between the gauges [-].
     corrected : ndarray, shape (g,)
-        Rms of each gauge less what the others explain of it by linear regression [-].
+        Rms of each gauge without the part that the others explain by linear regression [-].
     shared, own : ndarray, shape (g,)
-        Rms of what the first principal component of all gauges makes of each, and of the rest [-].
+        Rms of the first principal component of all gauges in each gauge, and of the rest [-].
     memory : ndarray, shape (4,)
         Autoregression of that component, newest sample first [-].
     """
@@ -98,7 +98,7 @@ def noise(recording, part):
     rest = rest[:, live[known]]
     if rest.size:
         correlation[np.ix_(live, live)] = np.atleast_2d(np.corrcoef(rest.T))
-        # Of a covariance C the part of one that the others do not tell has the variance 1 / (C^-1)_ii.
+        # With a covariance C, the part of one variable that the others do not explain has the variance 1 / (C^-1)_ii.
         inverse = np.linalg.pinv(np.atleast_2d(np.cov(rest.T, bias=True)), hermitian=True)
         corrected[live] = 1.0 / np.sqrt(np.diag(inverse))
         shared[live], own[live], memory = _shared(rest)

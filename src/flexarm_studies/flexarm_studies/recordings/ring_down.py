@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Free vibration while the joints stand: frequency and damping of what a gauge reads.
+r"""Fits free vibration while the joints stand: frequency and damping of a gauge's reading.
 
 .. math::
     \varepsilon(t) = e^{-\sigma t}(a\cos\omega t + b\sin\omega t) + c + dt,
     \qquad \zeta = \sigma/\sqrt{\sigma^2 + \omega^2}
 
-fitted by least squares; a, b, c, d are linear and solved for at every :math:`(\omega, \sigma)`. Intervals take into
-account that residuals follow from sample to sample, :math:`e_k = \rho e_{k-1} + u_k`: with V their covariance and J the
-derivatives by all six numbers, that of the numbers is :math:`(J^TJ)^{-1}J^TVJ(J^TJ)^{-1}`. The residuals of few samples
-seem whiter than what they are left of, because six numbers were fitted to it: :math:`\rho` is that of the restricted
-likelihood (Patterson and Thompson, Biometrika 58, 1971), which allows for that.
+is fitted by least squares; a, b, c, d are linear and solved for at every :math:`(\omega, \sigma)`. Intervals take into
+account that residuals are correlated from sample to sample, :math:`e_k = \rho e_{k-1} + u_k`: with V their covariance
+and J the derivatives by all six numbers, the covariance of the numbers is :math:`(J^TJ)^{-1}J^TVJ(J^TJ)^{-1}`. The
+residuals of few samples seem whiter than the errors, because six numbers were fitted. :math:`\rho` is that of the
+restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), which allows for that.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.signal import lfilter
 
-#: What counts as a ring-down: this fraction of the variance is explained, amplitude over noise, damping ratio, periods.
+#: Conditions of a ring-down: explained fraction of the variance, amplitude over noise, damping ratio, periods.
 EXPLAINED, OVER_NOISE, MAX_DAMPING, MIN_PERIODS = 0.9, 5.0, 0.3, 1.5
 #: Start of the fit: damping rate over frequency [-].
 START = 0.01
@@ -36,7 +36,7 @@ class RingDown:
     part : slice
         The samples.
     gauge : int
-        Of the largest amplitude over its noise.
+        Index of the gauge with the largest amplitude over its noise.
     frequency, frequency_width : float
         Damped frequency, and half of its 95 % interval [Hz].
     damping, damping_width : float
@@ -44,7 +44,7 @@ class RingDown:
     amplitude : float
         At the beginning [-].
     explained : float
-        Fraction of the variance, apart from the line [-].
+        Fraction of the variance, without the line [-].
     """
 
     part: slice
@@ -94,7 +94,7 @@ def _is_one(made, period):
 
 
 def fit(values, period, part=None, gauge=0):
-    """The `RingDown` that is nearest to `values` (s,), one per `period` [s]; `part` and `gauge` say whose they are."""
+    """The `RingDown` closest to `values` (s,), one per `period` [s]; `part` and `gauge` are those of the values."""
     count, size_of = len(values), max(float(np.std(values)), 1e-300)
     values = (values - np.mean(values)) / size_of
     time = period * np.arange(count)
@@ -130,13 +130,13 @@ def fit(values, period, part=None, gauge=0):
 
 
 def covariance(J, error):
-    """Covariance (p, p) of a fit with derivatives J (s, p), whose residuals (s,) follow from sample to sample."""
+    """Covariance (p, p) of a fit with derivatives J (s, p), whose residuals (s,) are correlated in time."""
     count, unknowns = J.shape
     J, size = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), np.linalg.norm(J, axis=0)
     if count <= unknowns or not np.any(error):
         return np.zeros((unknowns, unknowns))
 
-    def new(values, memory):  # what does not follow from the sample before
+    def new(values, memory):  # the part that does not follow from the sample before
         out = values.copy()
         out[0] *= np.sqrt(1.0 - memory**2)
         out[1:] -= memory * values[:-1]

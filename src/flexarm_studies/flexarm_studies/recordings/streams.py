@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signals with clocks of their own, such as joint states and an IMU, as one `Recording` on the fastest one's grid.
+"""Joins signals with separate clocks, such as joint states and an IMU, to one `Recording` on the fastest one's grid.
 
-In between, a cubic through the four samples around is used; a gap in any of them is one of the recording.
+Between samples, a cubic through the four samples around is used. A gap in any signal is a gap of the recording.
 """
 
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 from ..identification.recording import JITTER, MIN_SAMPLES, OF_JOINTS, kind_of, uniform
 
-#: More samples than this are none of a measurement.
+#: More samples than this can't be a measurement.
 MAX_SAMPLES = 10_000_000
 
 
@@ -24,7 +24,7 @@ class Stream:
     Attributes
     ----------
     name : str
-        For messages: its topic, say.
+        Its name in messages, for example its topic.
     time : ndarray, shape (k,)
         Stamps [s].
     signals : dict
@@ -40,7 +40,7 @@ class Stream:
 
 
 def join(streams):
-    """One `Recording` of some streams.
+    """Join some streams to one `Recording`.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def _ascending(stream):
 
 
 def _covered(time, period, grid):
-    """Which times of the grid lie in no gap, shape (k,) bool."""
+    """Which times of the grid are not in a gap, shape (k,) bool."""
     after = np.clip(np.searchsorted(time, grid), 1, time.size - 1)
     return time[after] - time[after - 1] <= 2.0 * (1.0 + JITTER) * period
 
@@ -129,7 +129,7 @@ def of_joints(name, time, joint_names, **signals):
     Raises
     ------
     FlexarmError
-        For a quantity that joints have not.
+        For a quantity that joints do not have.
     """
     for quantity in signals:
         if quantity not in OF_JOINTS:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording shows, as plain data: times, channels, rests, noise, drift, delays, ring-downs, spectra."""
+"""Summarises a recording as plain data: times, channels, rests, noise, drift, delays, ring-downs, spectra."""
 
 import numpy as np
 
@@ -18,16 +18,16 @@ UNITS = {
     "linear_acceleration": "m/s^2",
     "angular_velocity": "rad/s",
 }
-#: Length of the pieces of a spectrum [s]; peaks that are reported: so many, so far above their surroundings [-].
+#: Length of the pieces of a spectrum [s]; max. number of reported peaks, and min. factor above their surroundings [-].
 SEGMENT, MAX_PEAKS, OUTSTANDING = 8.0, 4, 4.0
 #: A line of the spectrum is compared with the median over this many around it.
 AROUND = 41
-#: Two channels are late against each other only if they are this much alike [-].
+#: A delay between two channels is given only if their correlation is at least this [-].
 ALIKE = 0.5
 
 
 def summary(recording):
-    """All that is found in a `recording`, ready for JSON: numbers in SI, None for what is not known."""
+    """All that is found in a `recording`, ready for JSON: numbers in SI, None for unknown values."""
     parts = rest.stretches(recording)
     quiet, rings = quiet_and_rings(recording, parts)
     slowest = min((r.frequency for r in rings), default=None)
@@ -45,7 +45,7 @@ def summary(recording):
 
 
 def channels(recording):
-    """Yield quantity, of what, and values (s,) of each channel that was measured."""
+    """Yield the quantity, the name, and the values (s,) of each channel that was measured."""
     for quantity in SIGNALS:
         values = getattr(recording, quantity)
         kind = kind_of(quantity)
@@ -74,7 +74,7 @@ def quiet_and_rings(recording, parts):
     rings = []
     for part in sorted(parts, key=lambda p: p.stop - p.start, reverse=True):
         found = rest.noise(recording, part)
-        # A gauge that rings is no noise: what all gauges have in common then is the vibration.
+        # A gauge that rings does not show noise: what all gauges have in common then is the vibration.
         ringing = ring_down.find(recording, [part], np.full(found.rms.size, 1e-15))
         if not ringing:
             rings = ring_down.find(recording, parts, found.rms)
@@ -153,7 +153,7 @@ def _drift(recording, slowest):
 
 
 def _delays(recording):
-    """Of speeds after the angles' derivative, of accelerations after the speeds', of gauges after the first one."""
+    """Delays of speeds after the angles' rates, of accelerations after the speeds', of gauges after the first one."""
     found, period = [], recording.period
     pairs = (("velocity", "position"), ("acceleration", "velocity"))
     for later, earlier in pairs:
@@ -165,7 +165,7 @@ def _delays(recording):
     strain = [(n, v) for q, n, v in channels(recording) if q == "strain"]
     for name, values in strain[1:]:
         first, reference = strain[0]
-        # What moves slowly is alike at any small delay.
+        # Slow signals correlate at any small delay.
         fast = [v - rest.low_passed(v[:, None], period, 1.0)[:, 0] for v in (values, reference)]
         _late(found, name, first, *fast, period)
     return found

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Drift and delay of the gauges of a recording, without a model of the arm.
+r"""Finds drift and delay of the gauges of a recording, without a model of the arm.
 
-What a rigid arm's motion makes of a strain is, to good accuracy,
+To good accuracy, the motion of a rigid arm causes the strain
 
 .. math::
     \varepsilon = \sum_p \Big(g_p + \sum_i h_{pi}\ddot q_i + \sum_{i\le j} c_{pij}\dot q_i\dot q_j\Big)\pi_p(q),
     \qquad \pi_p = \prod_i\{1, \cos q_i, \sin q_i\}
 
-(the weight's moment is exactly such a sum). With these, a line in time, and the strain's own rate as regressors, both
-sides below a corner well under the bending, the line is the drift and the rate's coefficient is minus the delay: a
-channel that is late by :math:`\tau` reads
-:math:`\varepsilon(t - \tau)\approx\varepsilon - \tau\dot\varepsilon`. Intervals are those of Newey and West (1987), for
-what is left is as slow as the motion. A gear with play or friction looks like a delay, too.
+(the weight's moment is exactly such a sum). The regressors are these terms, a line in time, and the strain's own rate,
+all below a corner well under the bending. The line is then the drift, and the rate's coefficient is minus the delay: a
+channel that is late by :math:`\tau` reads :math:`\varepsilon(t - \tau)\approx\varepsilon - \tau\dot\varepsilon`.
+Intervals are those of Newey and West (1987), because the residual is as slow as the motion. A gear with play or
+friction looks like a delay, too.
 """
 
 import itertools
@@ -20,17 +20,17 @@ import numpy as np
 
 from .rest import CORNER, derivative, low_passed
 
-#: The corner is this fraction of the slowest vibration, whose frequency is this where none was seen [-], [Hz].
+#: The corner is this fraction of the frequency of the slowest vibration [-]; that frequency if none was found [Hz].
 BELOW, UNKNOWN = 1.0 / 6.0, 3.0
-#: With more regressors there are no results: at least so many periods of the corner for each.
+#: Minimum number of periods of the corner for each regressor; otherwise there are no results.
 PER_REGRESSOR = 0.4
-#: Delays between two channels are looked for up to this [s].
+#: Largest delay between two channels that is searched for [s].
 LONGEST = 0.25
 NORMAL = 1.959964
 
 
 def drift_and_delay(recording, vibration=None):
-    """What a recording's gauges do beside following the motion.
+    """What the gauges of a recording do in addition to following the motion.
 
     Parameters
     ----------
@@ -41,7 +41,8 @@ def drift_and_delay(recording, vibration=None):
     Returns
     -------
     drift, drift_width : ndarray, shape (g,)
-        From the recording's start to its end, and half of its 95 % interval [-]; NaN where the motion doesn't tell.
+        From the recording's start to its end, and half of its 95 % interval [-]; NaN if the motion does not determine
+        it.
     delay, delay_width : ndarray, shape (g,)
         Of the strain after the motion [s].
     """
@@ -79,7 +80,7 @@ def _rigid(recording):
 
 
 def regression(X, y, lags):
-    """Least squares: coefficients, and halves of their 95 % intervals with residuals correlated over so many lags.
+    """Least squares: coefficients, and halves of their 95 % intervals for residuals correlated over `lags` samples.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ def regression(X, y, lags):
 
 
 def lag(later, earlier, period):
-    """By how much one series follows another, and how alike they then are.
+    """Delay of one series after another, and their correlation at that delay.
 
     Parameters
     ----------

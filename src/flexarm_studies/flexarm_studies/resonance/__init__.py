@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frequencies and damping of what rings, from recordings, and the shaper that takes it out: ``flexarm resonance``."""
+"""``flexarm resonance``: finds frequencies and damping of ringing modes in recordings, and the shaper against them."""

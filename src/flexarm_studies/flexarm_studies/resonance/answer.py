@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How a sensor answers small motions of each joint, near a mode: what damping by that sensor needs to know.
+r"""Finds a sensor's response to small motions of each joint, near a mode, which damping by that sensor needs to know.
 
 With the model of `flexarm_control.shaping.strain_damping`, :math:`\dot z = p z + \beta u` and a reading Re z, a command
-that goes from one place to another leaves ringing of the amplitude
+from one place to another leaves ringing of the amplitude
 
 .. math:: a(t) = \frac{\beta}{p}\int \dot u(\tau)\,e^{p(t-\tau)}\,d\tau,
 
-since a joint that stands elsewhere does not bend the links. The amplitude after each step of a measurement, less what
-is left of the ringing before it, over this integral is :math:`\beta`: its modulus the sensitivity, its angle the phase,
-with the delay and the drive in it.
+because the place where a joint stands does not bend the links. :math:`\beta` is the amplitude after each step of a
+measurement, minus the rest of the ringing before it, divided by this integral. Its modulus is the sensitivity. Its
+angle is the phase, with delay and drive included.
 """
 
 import cmath
@@ -26,7 +26,7 @@ from .motion import SETTLED
 CELLS = 2000
 #: Sensors that can damp, and their name in the node's parameters.
 SENSORS = {"strain": "strain", "linear_acceleration": "imu"}
-#: Of an IMU, in the lines to paste [m/s^2].
+#: Full scale of an IMU, in the lines to paste [m/s^2].
 FULL_SCALE = 40.0
 #: Period of the commands for which the damping is checked [s].
 PERIOD = 0.008
@@ -41,13 +41,13 @@ class Answer:
     joint, channel, sensor : str
         Names; the sensor as in the node's parameters.
     index : int
-        Of the channel among those of its sensor.
+        Index of the channel among those of its sensor.
     frequency, damping : float
         Of the mode [Hz], [-].
     beta : complex
         [1/(rad s)] times the reading's unit.
     scatter : float
-        Between the steps of the measurement, over the modulus [-].
+        Scatter between the steps of the measurement, over the modulus [-].
     """
 
     joint: str
@@ -71,7 +71,7 @@ class Answer:
         }  # fmt: skip
 
     def refusal(self):
-        """Why the damping can't be, in words; empty where it can."""
+        """Why the damping is impossible, in words; empty if it is possible."""
         known = {parameter.name for parameter in strain_damping.PARAMETERS}
         given = {name: value for name, value in self.settings().items() if name in known}
         try:
@@ -89,21 +89,21 @@ def answers(found, windows, families, motion, begin):
     ----------
     found : Channels
     windows : list of Window
-        As of `measured.rings`, of a measurement by steps.
+        As from `measured.rings`, for a measurement by steps.
     families : list of Family
         Of these windows.
     motion : RingingMotion
     begin : float
-        When it was sent, as the recording counts the time [s].
+        Time when it was sent, as the recording counts it [s].
 
     Returns
     -------
     list of Answer
-        The one with the least scatter first; of its channel those of the other joints follow, by sensitivity.
+        All for the channel with the smallest scatter, sorted by sensitivity.
     """
     main = max(families, key=lambda family: family.part)
     rung = {i: mode for mode, i in zip(main.modes, main.windows, strict=True)}
-    parts = {}  # of each joint: (what the step makes of beta, what rang) of its windows
+    parts = {}  # for each joint: (response to the step over beta, amplitude) in its windows
     last, before = 0.0, None
     for first, end, joint in motion.free:
         number = _window(windows, begin + first, begin + end)
@@ -135,7 +135,7 @@ def _window(windows, first, end):
 
 
 def _amplitude(found, window, mode):
-    """Of one of the modes of a window in each channel at its begin, (c,) complex: all of its modes by least squares."""
+    """Amplitude of a mode in each channel at a window's begin, (c,) complex, by least squares of all its modes."""
     part = found.rows(window.begin, window.end)
     time = found.period * np.arange(part.stop - part.start)
     turning = np.exp(np.array([m.pole for m in window.fit.modes]) * time[:, None])
@@ -147,7 +147,7 @@ def _amplitude(found, window, mode):
 
 
 def _step(pole, motion, joint, first, last, at):
-    """What a motion of a joint from `first` to `last` leaves at a time `at`, for a beta of 1 [rad s]."""
+    """Response to a motion of a joint from `first` to `last` at a time `at`, for a beta of 1 [rad s]."""
     step = (last - first) / CELLS
     time = first + step * (np.arange(CELLS) + 0.5)
     speed = motion.derivative(1, time)[:, joint]

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What a given motion excites: the vibration that it leaves in a mode of a unit that hangs at each joint.
+r"""Computes what a motion excites: the vibration that it leaves in a unit oscillator at each joint.
 
 .. math:: \ddot x + 2\zeta\omega\dot x + \omega^2 x = -\ddot q_j, \qquad
     \hat x_j = \frac1\omega\Bigl|\int_0^T \ddot q_j\,e^{p(T-t)}\,dt\Bigr|
 
-is the amplitude at its end T. How much of it the tip has is the arm's; what a shaper leaves of it is not.
+is the amplitude at its end T. The part that appears at the tip depends on the arm; the part that a shaper leaves does
+not.
 """
 
 from pathlib import Path
@@ -18,9 +19,9 @@ from flexarm_dynamics.errors import TrajectoryError
 
 from .recommendation import BY_PROGRAMME, SMOOTH, box, impulses, train_of
 
-#: Types of the node `shaper`, which can be recommended; ``none`` where no more is wanted.
+#: Types of the node `shaper` that can be recommended; ``none`` if nothing is needed.
 NODE = KINDS
-#: Times per period of the fastest mode, and at most so many in all.
+#: Times per period of the fastest mode, and their maximum total number.
 PER_PERIOD, MOST = 40, 200_000
 
 
@@ -71,7 +72,7 @@ def steps(trajectory, fastest):
     ----------
     trajectory : JointTrajectoryData
     fastest : float
-        Frequency that is to be resolved [Hz].
+        Frequency that must be resolved [Hz].
 
     Returns
     -------
@@ -120,7 +121,7 @@ def left(time, change, poles):
 
 
 def of_trajectory(trajectory, spreads, candidates, retimed=None):
-    """What a motion leaves of each mode, as it is and with each candidate.
+    """Vibration that a motion leaves in each mode, unshaped and with each candidate.
 
     Parameters
     ----------
@@ -134,8 +135,8 @@ def of_trajectory(trajectory, spreads, candidates, retimed=None):
     Returns
     -------
     list of dict
-        Of each candidate: kind, duration_s, added_s, residual (over the motion as it is; predicted), amplitude_rad (per
-        mode, the worst joint and pole), modes, spread and periods (as of `Candidate`).
+        For each candidate: kind, duration_s, added_s, residual (predicted; relative to the unshaped motion),
+        amplitude_rad (per mode, the worst joint and pole), modes, spread and periods (as in `Candidate`).
     """
     fastest = max(s.high for s in spreads)
     time, change = steps(trajectory, fastest)
@@ -176,7 +177,7 @@ def _row(candidate, time, amplitudes):
 
 
 def recommended(rows, residual):
-    """The row of the node's shaper that is quickest and leaves what is wanted, or leaves least.
+    """The row of the node's quickest shaper that leaves at most the wanted residual, or of the one that leaves least.
 
     Parameters
     ----------
@@ -193,7 +194,7 @@ def recommended(rows, residual):
 
 
 def _response(candidate, spreads):
-    """What a candidate's kernel does to poles (k,); None where it has none."""
+    """Response of a candidate's kernel at poles (k,); None if it has none."""
     if candidate.kind in SMOOTH:
         return box(candidate.width, SMOOTH[candidate.kind])
     if candidate.kind == BY_PROGRAMME:

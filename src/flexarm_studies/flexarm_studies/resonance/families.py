@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The same mode in several windows: its spread of frequency and damping, and how it depends on the joints.
+r"""Joins the same mode from several windows: spread of frequency and damping, and dependence on the joints.
 
-Between configurations the frequency is :math:`f(q) = f_0 + g\cdot(q - \bar q)`, by least squares with the weights of
-the intervals, where that predicts windows that were left out better than a constant does.
+Between configurations the frequency is :math:`f(q) = f_0 + g\cdot(q - \bar q)`, by least squares weighted with the
+intervals, if this predicts left-out windows better than a constant does.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-#: Modes farther apart than this are not the same, of the logarithm of their frequencies [-].
+#: Modes are different if the logarithms of their frequencies differ by more than this [-].
 GAP = 0.2
-#: What an amplitude is divided by, to be that of a deflection: this power of omega.
+#: An amplitude is divided by this power of omega to get that of a deflection.
 POWERS = {"linear_acceleration": 2, "acceleration": 2, "velocity": 1, "angular_velocity": 1}
-#: A fit over the joints counts if it predicts windows that were left out this much better than their mean [-].
+#: A fit over the joints is used if its error for left-out windows is below this fraction of that of the mean [-].
 BETTER = 0.6
 #: A joint that moves less than this between the windows has no slope [rad or m].
 MOVES = 0.02
@@ -21,16 +21,16 @@ MOVES = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """A mode, seen in several windows.
+    """A mode that was found in several windows.
 
     Attributes
     ----------
     modes : tuple of Mode
         One per window in which it rings.
     windows : tuple of int
-        Which.
+        Indices of these windows.
     part : float
-        Of the squares of all deflections, over all windows and channels [-].
+        Fraction of the squares of all deflections, over all windows and channels [-].
     """
 
     modes: tuple
@@ -43,7 +43,7 @@ class Family:
 
     @property
     def frequencies(self):
-        """Lowest and highest frequency, their intervals included [Hz]."""
+        """Lowest and highest frequency, including their intervals [Hz]."""
         value, width = self.values("frequency"), self.values("frequency_width")
         return float((value - width).min()), float((value + width).max())
 
@@ -60,7 +60,7 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class Dependence:
-    """A family's frequency over the joints.
+    """Dependence of a family's frequency on the joints.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Dependence:
     slope : ndarray, shape (n,)
         [Hz/rad]
     error, constant_error : float
-        Rms with which it, and the mean, predict a window that was left out [Hz].
+        Rms error of its prediction, and of that by the mean, for a left-out window [Hz].
     """
 
     mean: np.ndarray
@@ -109,7 +109,8 @@ def families(windows, quantities):
     if not all_modes:
         return []
     squares = np.array([_deflections(mode, quantities) ** 2 for mode, _ in all_modes])
-    # Quantities count alike, whatever their units are, and within one the channel that rings more counts more.
+    # All quantities have the same weight, whatever their units. Within a quantity, a channel that rings more counts
+    # more.
     size = {
         q: squares[:, [k for k, of in enumerate(quantities) if of == q]].sum() for q in quantities
     }
@@ -145,7 +146,7 @@ def _groups(all_modes, members):
 
 
 def dependence(family, windows):
-    """How a family's frequency depends on the joints; None where too few windows tell it.
+    """How a family's frequency depends on the joints; None if too few windows show it.
 
     Parameters
     ----------

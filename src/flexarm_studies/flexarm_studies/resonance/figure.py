@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A figure of what rings: spectrum, decay and fit, frequencies, and what each shaper leaves at which delay."""
+"""Draws what rings: spectrum, decay and fit, frequencies, and what each shaper leaves at which delay."""
 
 import numpy as np
 
@@ -7,17 +7,17 @@ from ..commands.options import check_file
 from ..plotting import COMPOSITE, REFERENCE, SLOW, plt, save
 from ..recordings.summary import UNITS, spectrum
 
-#: Windows whose decay is drawn.
+#: Number of windows whose decay is drawn.
 DECAYS = 3
 
 
 def draw(made, path):
-    """Draw the `Study` that was `made`; the path.
+    """Draw the `Study` that was `made`; return the path.
 
     Raises
     ------
     FlexarmError
-        For a path that is no picture's.
+        For a path that is not that of a picture.
     """
     path = check_file(path, "--figure")
     figure = plt.figure(figsize=(13.0, 8.0), layout="constrained")

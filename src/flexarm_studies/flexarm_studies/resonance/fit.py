@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Frequencies and damping of modes in several channels, by least squares, with intervals for coloured noise.
+r"""Fits frequencies and damping of modes in several channels by least squares, with intervals for coloured noise.
 
 .. math:: y_c(t) = \sum_k \mathrm{Re}\{a_{kc} e^{p_k t} + b_{kc}\,(e^{p_k\cdot} * u)(t)\} + d_c u(t) + g_c + h_c t,
     \qquad p_k = -\sigma_k + j\omega_k
 
-with an input u, where there is one: the motion of a sweep; without one it is free ringing. The a, b, d, g, h are linear
-and solved for at every p (variable projection, Golub & Pereyra 1973). The start are the poles of `pencil`; a mode that
-the Bayesian information criterion does not want is left out.
+with an input u, the motion of a sweep; without an input it is free ringing. The a, b, d, g, h are linear and solved for
+at every p (variable projection, Golub & Pereyra 1973). The fit starts from the poles of `pencil`. A mode is left out if
+this improves the Bayesian information criterion.
 
 The errors of :math:`\omega,\sigma` are :math:`(J'J)^{-1}J'SJ(J'J)^{-1}` with the Jacobian J and the covariance S of the
-residuals. J of a mode is narrow in frequency, so that S counts near the mode: it is the spectral density of the
-residuals, of all channels together, smoothed over some lines around.
+residuals. The J of a mode is narrow in frequency, so only S near the mode matters: it is the spectral density of the
+residuals of all channels together, smoothed over some neighbouring lines.
 """
 
 from dataclasses import dataclass
@@ -22,21 +22,21 @@ from scipy.signal import lfilter
 from . import pencil
 
 TURN = 2.0 * np.pi
-#: Greatest damping ratio, and least one, of what rings [-].
+#: Largest and smallest damping ratio of a ringing mode [-].
 MAX_DAMPING, MIN_DAMPING = 0.3, 1e-5
-#: Modes with a wider interval of the frequency over the frequency are no finding [-].
+#: Modes whose interval of the frequency, over the frequency, is wider are dropped [-].
 MAX_WIDTH = 0.1
-#: A mode is left out whose rms is below this fraction of the largest in every channel [-].
+#: A mode is left out if its rms is below this fraction of the largest in every channel [-].
 MIN_PART = 0.02
-#: ... and below so many times what noise of the same density would make in its place in every channel [-].
+#: ... and below this many times the rms that noise of the same density would cause in its place in every channel [-].
 OVER_NOISE = 20.0
-#: Poles of a sweep that are nearer than this to each other, over their size, are one mode [-].
+#: Poles of a sweep whose distance, over their size, is less than this are one mode [-].
 SWEPT_TWIN = 0.08
-#: Most modes, and lines of the spectrum over which that of the residuals is smoothed.
+#: Max. number of modes, and lines over which the residuals' spectrum is smoothed.
 MAX_MODES, SMOOTHED = 6, 4
-#: Samples per period of the highest frequency; more are averaged.
+#: Samples per period of the highest frequency; if there are more, they are averaged.
 PER_PERIOD = 4.0
-#: Highest frequency, unless another is asked for [Hz]; least number of periods in a window.
+#: Default of the highest frequency [Hz]; min. number of periods in a window.
 HIGHEST, MIN_PERIODS = 30.0, 1.5
 MIN_SAMPLES = 16
 NORMAL = 1.959964
@@ -53,7 +53,7 @@ class Mode:
     damping, damping_width : float
         Ratio, and half of its 95 % interval [-].
     amplitude : ndarray, shape (c,)
-        Of its free ringing in each channel, at the first sample, in the channel's unit.
+        Amplitude of its free ringing in each channel, at the first sample, in the channel's unit.
     """
 
     frequency: float
@@ -80,7 +80,7 @@ class Fit:
     explained : ndarray, shape (c,)
         Fraction of each channel's variance about a straight line [-].
     time : ndarray, shape (s,)
-        Of the samples of the fit, from the window's first [s].
+        Times of the samples of the fit, from the window's first sample [s].
     measured, fitted : ndarray, shape (s, c)
         In the channels' units.
     """
@@ -104,14 +104,14 @@ def fit(values, period, low=0.0, high=HIGHEST, motion=None, direct=None) -> Fit:
     low, high : float
         Frequencies [Hz].
     motion : ndarray, shape (s, m), optional
-        What moves the arm, say accelerations of the joints; None: nothing does.
+        What moves the arm, for example accelerations of the joints; None: nothing moves it.
     direct : ndarray, shape (s, d), optional
-        What the channels have in them by themselves beside the motion, say its speed and its way.
+        What the channels contain directly of the motion, for example its speed and its way.
 
     Returns
     -------
     Fit
-        Without modes where nothing rings, or where the window is too short.
+        Without modes if nothing rings, or if the window is too short.
     """
     block = max(int(1.0 / (PER_PERIOD * high * period)), 1)
     values, period = averaged(values, block), block * period
@@ -135,7 +135,7 @@ def fit(values, period, low=0.0, high=HIGHEST, motion=None, direct=None) -> Fit:
 
 
 def averaged(values, block):
-    """Means of `block` rows of `values` (s, c) each: a sine stays one, and there are no edges as those of a filter."""
+    """Means of `block` rows of `values` (s, c) each: a sine stays a sine, without a filter's edge effects."""
     rows = len(values) // block
     return values[: rows * block].reshape(rows, block, values.shape[1]).mean(axis=1)
 
@@ -159,12 +159,12 @@ class _Problem:
 
     @property
     def per_mode(self):
-        """Numbers that a mode takes."""
+        """Number of parameters of a mode."""
         inputs = 0 if self.motion is None else self.motion.shape[1]
         return 2 + 2 * self.values.shape[1] * (1 + inputs)
 
     def ringing(self):
-        """What is to be free ringing, for the start, shape (s, c)."""
+        """The signals that should be free ringing, for the start, shape (s, c)."""
         if self.motion is None:
             return _about_line(self.values)
         return impulse_responses(self.values, self.motion)
@@ -182,7 +182,7 @@ class _Problem:
         return np.hstack(columns)
 
     def residual(self, poles):
-        """What no linear part explains (s, c), weighted; its coefficients."""
+        """What the linear part does not explain (s, c), weighted; and the coefficients of that part."""
         B, target = self.basis(poles), self.values * self.weight
         coefficients = np.linalg.lstsq(B, target, rcond=1e-10)[0]
         return target - B @ coefficients, coefficients / self.weight
@@ -197,11 +197,11 @@ class _Solution:
 
 
 def _solve(problem, poles):
-    """Least squares from these poles, the channels weighted by what is left of them."""
+    """Least squares from these poles, with the channels weighted by their residuals."""
     x = np.array([[p.imag, -p.real] for p in poles]).ravel()
     omega = np.repeat([p.imag for p in poles], 2)
     scale, bounds = omega * np.tile([0.05, 0.02], len(poles)), None
-    if len(poles):  # a fit that leaves these goes to another mode, or to none
+    if len(poles):  # outside of these, a fit goes to another mode, or to none
         low, high = (omega * np.tile(by, len(poles)) for by in ([0.7, -0.1], [1.4, 1.0]))
         bounds = low, high
         x = np.clip(x, low + 1e-6 * omega, high - 1e-6 * omega)
@@ -236,7 +236,7 @@ def _criterion(problem, solution):
 
 
 def _select(problem, start, low, high):
-    """Fit all that may be a mode, and leave out one after the other while that is better."""
+    """Fit all possible modes, and leave out one after the other while this is better."""
     solution = _solve(problem, start)
     while len(solution.poles):
         odd = _odd(problem, solution, low, high)
@@ -258,7 +258,7 @@ def _fixed(problem, poles):
 
 
 def _odd(problem, solution, low, high):
-    """Which pole is none of a mode that rings; None: all are."""
+    """Index of a pole that is not that of a ringing mode; None if all are."""
     poles = solution.poles
     ratio, hertz = -poles.real / np.abs(poles), poles.imag / TURN
     bad = (ratio < MIN_DAMPING) | (ratio > MAX_DAMPING) | (hertz < low) | (hertz > high)
@@ -266,26 +266,26 @@ def _odd(problem, solution, low, high):
     for k, most in enumerate((MAX_WIDTH, MAX_DAMPING)):
         bad |= ~(np.abs(widths[:, k, k]) < (most * poles.imag / NORMAL) ** 2)
     if bad.any():
-        # The most damped first. Two of them that cancel each other are large, so that modes look small beside them.
+        # The most damped first. Two of them that cancel each other are large, so modes look small beside them.
         return int(np.argmax(np.where(bad, ratio, -1.0)))
     power = _power(problem, solution)
     bad = (power < MIN_PART**2 * power.max(axis=0)).all(axis=1)
     density = np.abs(np.einsum("faa->fa", _density(problem, solution)))
     at = np.minimum(np.rint(2.0 * len(problem.values) * problem.period * hertz), len(density) - 1)
-    # White noise puts this much into the two columns of a mode.
+    # White noise contributes this much to the two columns of a mode.
     noise = 2.0 * density[np.maximum(at, 0).astype(int)] / problem.weight**2
     bad |= (power < OVER_NOISE * noise).all(axis=1)
     if bad.any():
         return int(np.argmax(bad))
     close = np.abs(np.subtract.outer(poles, poles)) + np.diag(np.full(len(poles), np.inf))
-    # What a sweep makes of its own mode by a delay or a drive that is not in the model is a twin with more damping.
+    # A delay or a drive that is not in the model causes a twin of a swept mode, with more damping.
     same = 0.5 * pencil.SAME if problem.motion is None else SWEPT_TWIN
     twin = (close < same * np.abs(poles)[:, None]).any(axis=1)
     return int(np.argmax(np.where(twin, ratio, -1.0))) if twin.any() else None
 
 
 def _power(problem, solution):
-    """Sum of the squares of what each mode makes in each channel, shape (k, c)."""
+    """Sum of the squares of the part of each mode in each channel, shape (k, c)."""
     B, first = problem.basis(solution.poles), problem.fixed.shape[1]
     each = (B.shape[1] - first) // len(solution.poles)
     parts = [slice(first + each * k, first + each * (k + 1)) for k in range(len(solution.poles))]
@@ -298,7 +298,7 @@ def _density(problem, solution):
     count, channels = rest.shape
     spectrum = np.fft.rfft(rest, 2 * count, axis=0)
     density = np.einsum("fa,fb->fab", spectrum, spectrum.conj()).reshape(len(spectrum), -1)
-    # Twice the lines, since the series is padded; each mode takes up two of the numbers near it.
+    # Twice the lines, because the series is padded; each mode takes two degrees of freedom near it.
     lines = 2 * SMOOTHED + 1
     kernel = np.ones(2 * lines - 1) / (2 * lines - 1)
     smooth = np.apply_along_axis(lambda v: np.convolve(v, kernel, "same"), 0, density)
@@ -329,7 +329,7 @@ def _modes(problem, solution, size, live, block):
     each = (solution.coefficients.shape[0] - first) // len(solution.poles)
     for k, pole in enumerate(solution.poles):
         own = solution.coefficients[first + each * k : first + each * k + 2]
-        # The mean over a block of samples is smaller than the first of them.
+        # The mean over a block of samples is smaller than the first sample of the block.
         steps = np.exp(pole * problem.period / block * np.arange(block)).mean()
         amplitude = np.zeros(len(size))
         amplitude[live] = size[live] * np.hypot(*own) / abs(steps)
@@ -364,7 +364,7 @@ def impulse_responses(values, motion, floor=1e-3):
     motion : ndarray, shape (s, m)
         At rest at both ends.
     floor : float
-        Of the motion's power, relative to the largest: where there is less, the response fades [-].
+        Floor of the motion's power, relative to the largest: where the power is less, the response fades [-].
 
     Returns
     -------

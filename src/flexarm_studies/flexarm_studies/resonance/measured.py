@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what an arm did under a `RingingMotion` to the modes that rang."""
+"""Finds the modes that rang in an arm after a `RingingMotion`."""
 
 import numpy as np
 
@@ -9,9 +9,9 @@ from . import windows
 from .fit import fit
 from .windows import Window
 
-#: The motion may begin this much after it was sent [s].
+#: Max. time from sending a motion to its begin [s].
 LATEST = 0.5
-#: Of the swept way that a channel may have in it by itself: what the position loops make of it [s].
+#: Delays of the swept way that a channel may contain directly, caused by the position loops [s].
 LAGS = (0.0, 0.025, 0.05, 0.1, 0.15)
 
 
@@ -24,7 +24,7 @@ def rings(recording, motion, begin, wishes):
         With the joint positions.
     motion : RingingMotion
     begin : float
-        When it was sent, as the recording counts the time [s].
+        Time when it was sent, as the recording counts it [s].
     wishes : Wishes
 
     Returns
@@ -56,7 +56,7 @@ def rings(recording, motion, begin, wishes):
 
 
 def delay(found, motion, begin):
-    """How long after it was sent the joints follow a motion [s]: the largest correlation of positions.
+    """Time from sending a motion until the joints follow it [s], from the largest correlation of positions.
 
     Parameters
     ----------

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Small motions that make an arm ring, the bounds that they keep, and the bounds at which a measurement stops.
+r"""Makes small motions that cause an arm to ring, within bounds, and stops a measurement that leaves its bounds.
 
-``step``: each joint goes a little way and back, with the acceleration's limit forwards and then backwards, and rests
-after each, so that it rings freely. ``sweep``: each joint swings with
+``step``: each joint goes a small distance and back, with maximum acceleration and then deceleration, and rests after
+each, so it rings freely. ``sweep``: each joint swings with
 
 .. math:: x = A(f)\sin\varphi(t),\quad \dot\varphi = 2\pi f,\quad f = f_1(f_2/f_1)^{t/T},\quad
     A = 0.9\min\Bigl(d, \frac{v}{2\pi f}, \frac{a}{(2\pi f)^2}\Bigr)
 
-faded in and out, and rests. The points have positions and velocities: cubics in between, as every trajectory controller
-has them.
+faded in and out, and rests. The points have positions and velocities, with cubics in between, as in every trajectory
+controller.
 """
 
 from abc import ABC, abstractmethod
@@ -22,31 +22,31 @@ from flexarm_dynamics.errors import FlexarmError
 
 #: Fraction of the bounds that a motion uses [-].
 USED = 0.9
-#: A sweep is made smaller where it would use more than this [-].
+#: A sweep is made smaller if it would use more than this fraction [-].
 MOST = 0.97
 #: Points per second of a sweep, and of the check.
 RATE, CHECKED = 100.0, 1000.0
-#: Part of a sweep in which it is faded in, and out [-].
+#: Fraction of a sweep in which it is faded in, and out [-].
 FADED = 0.1
-#: After a motion's end free ringing begins once its controller has settled [s].
+#: After a motion's end, free ringing begins when the controller has settled, after this time [s].
 SETTLED = 0.2
-#: Speeds are differences of positions over this [s] where none is measured.
+#: If speeds are not measured, they are differences of positions over this time [s].
 OVER = 0.02
 STEP, SWEEP = "step", "sweep"
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the motion keeps, and what the arm may do.
+    """Bounds of the motion, and bounds of the arm's measured motion.
 
     Attributes
     ----------
     travel, velocity, acceleration : float
-        Of the motion, about where the arm stands [rad], [rad/s], [rad/s^2].
+        Bounds of the motion, about the arm's position [rad], [rad/s], [rad/s^2].
     stop_travel, stop_velocity : float
-        Of the measured joints; beyond these the measurement stops [rad], [rad/s].
+        Bounds of the measured joints; beyond these the measurement stops [rad], [rad/s].
     silence : float
-        Without joint states for this long it stops, too [s].
+        Time without joint states after which it stops, too [s].
     """
 
     travel: float = 0.05
@@ -57,7 +57,7 @@ class Bounds:
     silence: float = 0.5
 
     def __post_init__(self):
-        """Refuse what bounds nothing.
+        """Refuse values that are not bounds.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class Bounds:
 
 @dataclass(frozen=True, eq=False)
 class RingingMotion:
-    """Points of a motion, relative to where the arm stands.
+    """Points of a motion, relative to the arm's position.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class RingingMotion:
     positions, velocities : ndarray, shape (k, n)
         [rad], [rad/s]
     free, swept : tuple of (float, float, int)
-        Begin, end and joint of what rings freely, and of what is swept with the ringing after it [s].
+        Begin, end and joint of each free ringing, and of each sweep with the ringing after it [s].
     """
 
     times: np.ndarray
@@ -98,7 +98,7 @@ class RingingMotion:
 
     @property
     def duration(self):
-        """The rest at its end included [s]."""
+        """Duration with the rest at its end [s]."""
         return max((end for _, end, _ in (*self.free, *self.swept)), default=float(self.times[-1]))
 
     @cached_property
@@ -124,7 +124,7 @@ def design(kind, joints, n, bounds, rest=4.0, band=(1.0, 15.0), duration=10.0) -
     kind : str
         ``step`` or ``sweep``.
     joints : sequence of int
-        Which move, one after the other.
+        Joints that move, one after the other.
     n : int
         Number of joints.
     bounds : Bounds
@@ -138,7 +138,7 @@ def design(kind, joints, n, bounds, rest=4.0, band=(1.0, 15.0), duration=10.0) -
     Raises
     ------
     FlexarmError
-        For a kind, a joint, a time or a band that is not possible.
+        For an impossible kind, joint, time or band.
     """
     if kind not in (STEP, SWEEP):
         raise FlexarmError("is unknown", field="kind", value=kind, limit=f"{STEP}, {SWEEP}")
@@ -173,7 +173,7 @@ def design(kind, joints, n, bounds, rest=4.0, band=(1.0, 15.0), duration=10.0) -
 
 
 def _step(bounds, sign):
-    """There (or back) and a stop: time, position and speed at the corners of the speed."""
+    """A motion there (or back) and a stop: time, position and speed at the corners of the speed."""
     travel, top = USED * bounds.travel, USED * bounds.velocity
     acceleration = USED * bounds.acceleration
     rise = min(np.sqrt(travel / acceleration), top / acceleration)
@@ -194,7 +194,7 @@ def _sweep(bounds, band, duration):
     hertz = low * (high / low) ** (fine / duration)
     phase = 2.0 * np.pi * low * duration / np.log(high / low) * (hertz / low - 1.0)
     omega = 2.0 * np.pi * hertz
-    # A smooth minimum: corners of the amplitude would be steps of the speed.
+    # A smooth minimum: corners of the amplitude would cause steps of the speed.
     limits = (1.0 / bounds.travel, omega / bounds.velocity, omega**2 / bounds.acceleration)
     amplitude = USED * sum(limit**4 for limit in limits) ** -0.25
     edge = np.clip(np.minimum(fine, duration - fine) / (FADED * duration), 0.0, 1.0)
@@ -202,7 +202,7 @@ def _sweep(bounds, band, duration):
     velocity = np.gradient(position, fine, edge_order=2)
     velocity[[0, -1]] = position[[0, -1]] = 0.0
     time, position, velocity = fine[::20], position[::20], velocity[::20]
-    # Fading in, and a quick sweep, take more than the sine of the moment.
+    # Fading in, and a quick sweep, need more than the momentary sine.
     spline = BPoly.from_derivatives(time, np.stack([position, velocity], axis=1))
     near = np.linspace(0.0, duration, int(CHECKED * duration) + 1)
     limits = (bounds.travel, bounds.velocity, bounds.acceleration)
@@ -254,14 +254,14 @@ def check(made, bounds):
 
 
 class Arm(ABC):
-    """An arm that is moved through its trajectory interface; what a measurement needs of it.
+    """An arm that is moved through its trajectory interface; defines what a measurement needs.
 
     Attributes
     ----------
     joint_names : tuple of str
-        Of the n joints.
+        Names of the n joints.
     begin : float
-        When the motion was sent, as the streams count the time [s].
+        Time when the motion was sent, as the streams count it [s].
     """
 
     joint_names: tuple
@@ -271,7 +271,7 @@ class Arm(ABC):
     def sample(self, patience):
         """The next joint state: clock [s], position and velocity (n,) [rad], [rad/s]; None after a `patience` [s].
 
-        The velocity is None where it is not measured.
+        The velocity is None if it is not measured.
         """
 
     @abstractmethod
@@ -280,7 +280,7 @@ class Arm(ABC):
 
     @abstractmethod
     def stop(self):
-        """Have the arm stopped, and its present motion forgotten."""
+        """Stop the arm, and discard its present motion."""
 
     @abstractmethod
     def streams(self):
@@ -288,13 +288,13 @@ class Arm(ABC):
 
 
 class Watch:
-    """Whether the measured joints are within their bounds.
+    """Monitors whether the measured joints are within their bounds.
 
     Parameters
     ----------
     joint_names : sequence of str
     start : ndarray, shape (n,)
-        Where the arm stands [rad].
+        Position of the arm [rad].
     bounds : Bounds
     """
 
@@ -362,17 +362,17 @@ def measure(arm, motion, bounds, settle=1.0):
     motion : RingingMotion
     bounds : Bounds
     settle : float
-        Before the motion the arm must stand for so long [s].
+        Time for which the arm must stand before the motion [s].
 
     Returns
     -------
     ndarray, shape (n,)
-        Where it stood [rad].
+        Position in which it stood [rad].
 
     Raises
     ------
     FlexarmError
-        Where the arm does not stand before, leaves its bounds, or falls silent.
+        If the arm does not stand before, leaves its bounds, or sends no more states.
     """
     check(motion, bounds)
     start = _standing(arm, bounds, settle)
@@ -391,7 +391,7 @@ def measure(arm, motion, bounds, settle=1.0):
 
 
 def _standing(arm, bounds, settle):
-    """Where the arm stands; refused if it moves by a tenth of what the motion will."""
+    """Position of the arm; refused if it moves by a tenth of the motion's distance."""
     clock, start, _ = _next(arm, bounds)
     watch, end = Watch(arm.joint_names, start, bounds), clock + settle
     while clock < end:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Poles of a sum of decaying sines in several channels, by the matrix pencil, and those that stay the same with more.
+r"""Finds poles of decaying sines in several channels by the matrix pencil, and those that are stable over the orders.
 
-Column j of the Hankel matrix :math:`H_{(c,i),j} = y_c(i + j)` of samples of :math:`\sum_k r_{kc} z_k^t` is a sum of
-the same n vectors for all i and c, so that its right singular vectors :math:`V_n` fulfil
+Column j of the Hankel matrix :math:`H_{(c,i),j} = y_c(i + j)` of samples of :math:`\sum_k r_{kc} z_k^t` is a sum of the
+same n vectors for all i and c, so its right singular vectors :math:`V_n` fulfil
 
 .. math:: V_n^{1:} = V_n^{:-1}\,\Phi, \qquad \mathrm{eig}(\Phi) = z_k = e^{p_k T}
 
-(Hua & Sarkar 1990; the eigensystem realization algorithm of Juang & Pappa 1985 has the same poles). n is not known: a
-pole that many orders n have nearly alike is one of the signal, one that wanders is one of the noise (stabilisation).
+(Hua & Sarkar 1990; the eigensystem realization algorithm of Juang & Pappa 1985 has the same poles). n is unknown. A
+pole that is nearly the same for many orders n belongs to the signal; a pole that wanders belongs to the noise
+(stabilisation).
 """
 
 from itertools import pairwise
@@ -15,13 +16,13 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import eigh
 
-#: Columns of the Hankel matrix, and samples that are used [-].
+#: Max. number of columns of the Hankel matrix, and of samples that are used [-].
 MAX_COLUMNS, MAX_SAMPLES = 350, 1500
-#: Greatest order; every second one is tried.
+#: Largest order; every second one is tried.
 MAX_ORDER = 40
 #: Two poles are the same if they differ by less than this fraction of their size [-] and this over the duration [rad].
 SAME, RESOLVED = 0.015, 0.4
-#: In so many orders a pole has to be the same.
+#: Number of orders in which a pole must be the same.
 STABLE = 2
 
 

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Which shaper, or which smoothing, leaves as little vibration as is wanted, at the least delay.
+r"""Recommends the shaper, or the smoothing, that leaves at most the wanted vibration with the smallest delay.
 
-Every candidate is a kernel by which a motion is convolved. Of the vibration of a mode with the pole p it leaves
+Every candidate is a kernel with which a motion is convolved. At its end, L later, it leaves the fraction
 
 .. math:: V(p) = \left|\int_0^L k(\tau)\,e^{p(L-\tau)}\,d\tau\right|
 
-at its end, L later. Impulses are the shapers of `flexarm_control.motions.shapers`. A jerk limit is the kernel 1/W on
-[0, W], of which :math:`V = |(e^{pW} - 1)/(pW)|`: steps of the acceleration become ramps of the length W. A snap
-limit is two of these. Speeds and accelerations become no larger with any of them.
+of the vibration of a mode with the pole p. Impulses are the shapers of `flexarm_control.motions.shapers`. A jerk limit
+is the kernel 1/W on [0, W], with :math:`V = |(e^{pW} - 1)/(pW)|`: steps of the acceleration become ramps of the length
+W. A snap limit consists of two of these. None of them increases speeds or accelerations.
 
-Of several modes the residual is :math:`\sqrt{\sum_k s_k V_k^2}`, :math:`s_k` the part of the vibration's energy that
-mode k had in the recording, :math:`V_k` the largest over its spread of frequency and damping.
+For several modes the residual is :math:`\sqrt{\sum_k s_k V_k^2}`. Here :math:`s_k` is the fraction of the vibration's
+energy that mode k had in the recording, and :math:`V_k` is the largest V over its spread of frequency and damping.
 """
 
 from dataclasses import dataclass
@@ -23,15 +23,15 @@ from flexarm_dynamics.errors import FlexarmError
 from .time_law import least_exciting_duration
 
 TURN = 2.0 * np.pi
-#: Points over the spread of the frequency.
+#: Number of points over the spread of the frequency.
 POINTS = 41
-#: Widths of a smoothing that are tried, up to so many periods of the slowest mode.
+#: Number of widths of a smoothing that are tried, and the largest in periods of the slowest mode.
 WIDTHS, PERIODS = 400, 5.0
-#: The shaper by a linear programme, how long it may be in periods of the lowest mode, and steps to find that.
+#: The shaper by a linear programme, its minimum and maximum length in periods of the lowest mode, and steps to find it.
 ROBUST, SHORTEST, LONGEST, HALVINGS = "robust", 0.25, 3.0, 6
-#: Frequencies may be off by this fraction at most, as the node has it [-].
+#: Frequencies may be off by this fraction at most, as in the node [-].
 WIDEST = 0.5
-#: Names of the smooth ones, and how many boxes they are.
+#: Names of the smoothings, and their numbers of boxes.
 SMOOTH = {"jerk_limited": 1, "snap_limited": 2}
 BY_PROGRAMME = "least_exciting"
 
@@ -47,7 +47,7 @@ class Spread:
     dampings : tuple of float
         Lowest, middle and highest ratio [-].
     part : float
-        Of the vibration's energy [-].
+        Fraction of the vibration's energy [-].
     """
 
     low: float
@@ -57,12 +57,12 @@ class Spread:
 
     @property
     def frequency(self):
-        """Middle [Hz]."""
+        """Middle of the frequencies [Hz]."""
         return 0.5 * (self.low + self.high)
 
     @property
     def damping(self):
-        """Middle [-]."""
+        """Middle damping ratio [-]."""
         return self.dampings[1]
 
     def poles(self):
@@ -74,24 +74,24 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A shaper or a smoothing, and what it does.
+    """A shaper or a smoothing, and its effect.
 
     Attributes
     ----------
     kind : str
         Of `shapers.SHAPERS`, ``none``, of `SMOOTH`, or ``least_exciting``.
     modes : tuple of int
-        For which modes it is made; empty for a smoothing.
+        Modes for which it is made; empty for a smoothing.
     delay : float
-        By which a motion gets longer [s].
+        Time by which a motion gets longer [s].
     residual : float
-        Largest over the spread [-].
+        Largest residual over the spread [-].
     nominal : float
-        In the middle of the spread [-].
+        Residual in the middle of the spread [-].
     width : float
-        Of a smoothing's box [s]; 0 for others.
+        Width of a smoothing's box [s]; 0 for others.
     spread, periods : float
-        Of ``robust``: by which fraction the frequencies may be off, and its length in periods of the lowest mode [-].
+        For ``robust``: fraction by which the frequencies may be off, and length in periods of the lowest mode [-].
     """
 
     kind: str
@@ -106,14 +106,14 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Recommendation:
-    """What is recommended.
+    """The recommendation.
 
     Attributes
     ----------
     wanted : float
         Residual [-].
     candidates : tuple of Candidate
-        The quickest of each kind that meets the residual, or the best of its kind where none does.
+        The quickest of each kind that meets the residual, or the best of its kind if none does.
     chosen : Candidate
         A shaper: the quickest that meets the residual, or the best.
     """
@@ -143,9 +143,9 @@ def recommend(spreads, residual=0.05, move=None) -> Recommendation:
     spreads : sequence of Spread
         At least one.
     residual : float
-        Wanted, above 0, below 1 [-].
+        Wanted residual, above 0, below 1 [-].
     move : Move, optional
-        For which the least exciting time law is found; None: it is left out.
+        Motion for which the least exciting time law is found; None: it is left out.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def _quickest(candidates, residual):
 
 
 def _shapers(kind, spreads):
-    """One kind of shaper for the most important mode, the two most important, and so on."""
+    """One kind of shaper for the most important mode, for the two most important modes, and so on."""
     order = sorted(range(len(spreads)), key=lambda k: -spreads[k].part)
     return [_shaped(kind, spreads, tuple(sorted(order[: k + 1]))) for k in range(len(order))]
 
@@ -234,7 +234,7 @@ def train_of(kind, modes, spread=0.0, periods=1.0):
     kind : str
     modes : sequence of Spread
     spread, periods : float
-        Of ``robust``, as of `Candidate`.
+        For ``robust``, as in `Candidate`.
     """
     if kind == ROBUST:
         frequencies, dampings = [m.frequency for m in modes], [m.damping for m in modes]
@@ -271,7 +271,7 @@ def _smoothing(kind, spreads, residual):
 def _least_exciting(spreads, residual, move):
     part = np.array([s.part for s in spreads])
     part = part / part.sum()
-    # Poles of modes that hardly take part in it may have more.
+    # At poles of modes that hardly take part, the residual may be larger.
     wanted = residual / np.sqrt(np.maximum(part * len(part), 1e-6))
     poles = [s.poles() for s in spreads]
     longer = PERIODS / min(s.low for s in spreads)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shaper type ``retimed`` for one given motion: the shortest new time law that leaves what is wanted of it.
+"""Finds the shaper type ``retimed`` for a motion: the shortest new time law that leaves at most the wanted vibration.
 
-What it leaves is predicted by `flexarm_control.shaping.time_law`: of each mode the largest over its spread, over the
-largest that the motion leaves as it is; of several modes together as in `recommendation`.
+`flexarm_control.shaping.time_law` predicts what it leaves: for each mode the largest vibration over its spread, divided
+by the largest that the unshaped motion leaves. Several modes are combined as in `recommendation`.
 """
 
 from dataclasses import replace
@@ -19,9 +19,9 @@ from flexarm_dynamics.parameters import check_all
 from .recommendation import LONGEST, SHORTEST, WIDEST, Candidate
 
 RETIMED = modes_module.RETIMED
-#: Steps to find the shortest one.
+#: Number of steps to find the shortest one.
 HALVINGS = 5
-#: By which fraction frequencies may be off where they were measured in several configurations, as the node has it [-].
+#: Fraction by which frequencies may be off if they were measured in several configurations, as in the node [-].
 SPREAD = 0.15
 
 
@@ -38,7 +38,7 @@ def of_move(move) -> JointTrajectoryData:
 
 
 def retimed(trajectory, spreads, places, residual):
-    """The shortest new time law that leaves what is wanted, or the best.
+    """The shortest new time law that leaves at most the wanted residual, or the best one.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ def retimed(trajectory, spreads, places, residual):
     places : sequence of (ndarray, list of Spread)
         Configurations [rad] and the modes there; empty: they are the same everywhere.
     residual : float
-        Wanted [-].
+        Wanted residual [-].
 
     Returns
     -------
     tuple of Candidate and JointTrajectoryData, or None
-        None where the motion is not straight from rest to rest, or gives no velocities.
+        None if the motion is not straight from rest to rest, or has no velocities.
     """
     if len(trajectory.fields) == 1:
         return None
@@ -96,7 +96,7 @@ def _candidate(new, motion, modes, before, spreads):
 
 
 def _modes(motion, spreads, places, periods):
-    """The node's `Modes`."""
+    """The `Modes` of the node."""
     rows = [here for _, here in places] or [spreads]
     spread = SPREAD if places else max((s.high - s.low) / (s.high + s.low) for s in spreads)
     settings = {

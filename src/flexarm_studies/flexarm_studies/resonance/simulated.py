@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated arm behind a position loop, to be measured: trajectory in, joints, strains and tip acceleration out."""
+"""Simulates an arm behind a position loop for measurements: trajectory in; joints, strains, tip acceleration out."""
 
 import numpy as np
 
@@ -23,14 +23,14 @@ class SimulatedArm(Arm):
     arm : Arm or str
         Arm, or arm file.
     position : ndarray, shape (n,), optional
-        Where it stands, at rest under its weight [rad].
+        Position in which it stands, at rest under its weight [rad].
     **settings
-        Of the position loop, see `flexarm_sim.position_loop.PARAMETERS`.
+        Settings of the position loop, see `flexarm_sim.position_loop.PARAMETERS`.
 
     Raises
     ------
     FlexarmError
-        Where there is no such arm, or its position loop is unstable.
+        If there is no such arm, or its position loop is unstable.
     """
 
     def __init__(self, arm, position=None, **settings):
@@ -49,7 +49,7 @@ class SimulatedArm(Arm):
         self.stopped = False
 
     def sample(self, patience):
-        """As of `Arm`; it never falls silent."""
+        """As in `Arm`; it always sends states."""
         simulator, loop = self._simulator, self._loop
         tips = []
         for k in range(round(DRIVE_RATE / COMMAND_RATE)):
@@ -69,17 +69,17 @@ class SimulatedArm(Arm):
         self._loop.command(self._simulator.time, start + motion.derivative(0, time)[0])
 
     def move(self, motion, start):
-        """As of `Arm`: with the next command."""
+        """As in `Arm`: with the next command."""
         self.begin = self._simulator.time
         self._motion = motion, np.asarray(start, float), self.begin
 
     def stop(self):
-        """As of `Arm`: it holds where it is."""
+        """As in `Arm`: it holds its position."""
         self._motion, self.stopped = None, True
         self._loop.command(self._simulator.time, self._simulator.position)
 
     def streams(self):
-        """As of `Arm`: joint states, strains, acceleration of the tip."""
+        """As in `Arm`: joint states, strains, acceleration of the tip."""
         time, position, strain, tips = (np.array(part) for part in zip(*self._rows, strict=True))
         found = [of_joints("joint_states", time, self.joint_names, position=position)]
         gauges = self._simulator.arm.gauge_names

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a recording to a shaper: windows, modes, their spread, the recommendation; as plain data and as text."""
+"""Goes from a recording to a shaper: windows, modes, their spread, the recommendation; as plain data and as text."""
 
 from dataclasses import dataclass, replace
 
@@ -13,32 +13,32 @@ from .fit import HIGHEST
 from .recommendation import BY_PROGRAMME, LONGEST, WIDEST, Spread, recommend, widened
 from .time_law import Move
 
-#: A mode that takes part in less than this fraction of the vibration's energy is not shaped for [-].
+#: A mode with less than this fraction of the vibration's energy is not shaped for [-].
 MIN_PART = 1e-3
-#: Configurations nearer than this are one [rad].
+#: Configurations closer than this count as one [rad].
 SAME_PLACE = 0.05
-#: For the least exciting time law, unless another is asked for.
+#: Default motion for the least exciting time law.
 MOVE = Move(0.5, 1.0, 4.0)
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What is asked for.
+    """What the user wants.
 
     Attributes
     ----------
     residual : float
         Vibration that may be left [-].
     margin : float
-        By which frequencies may be off beyond what was measured [-].
+        Fraction by which frequencies may be off beyond the measured spread [-].
     low, high : float
-        Frequencies that are looked for [Hz].
+        Range of frequencies that are searched [Hz].
     windows : tuple of (float, float)
-        From when to when [s]; empty: they are found.
+        Begin and end of each [s]; empty: they are found.
     quantities : tuple of str
-        Empty: what there is.
+        Empty: all that exist.
     move : Move
-        For the least exciting time law.
+        Motion for the least exciting time law.
     """
 
     residual: float = 0.05
@@ -52,7 +52,7 @@ class Wishes:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """What a recording says of the modes, and what follows.
+    """What a recording shows about the modes, and what follows from it.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Study:
         Of each family, widened.
     recommendation : Recommendation
     answers : tuple of Answer
-        Of sensors to steps of the joints, where the arm was moved by these.
+        Responses of sensors to steps of the joints, if the arm was moved by these.
     """
 
     channels: windows.Channels
@@ -80,13 +80,13 @@ def study(recordings, wishes=None) -> Study:
     Parameters
     ----------
     recordings : sequence of Recording
-        With the same channels: of one arm, in several configurations, say.
+        With the same channels, for example of one arm in several configurations.
     wishes : Wishes, optional
 
     Raises
     ------
     FlexarmError
-        Where nothing rings, a window has no samples, or a recording has other channels than the first.
+        If nothing rings, a window has no samples, or a recording has other channels than the first.
     """
     wishes = wishes or Wishes()
     first, rings = None, []
@@ -126,7 +126,7 @@ def of_windows(found, rings, wishes) -> Study:
     Raises
     ------
     FlexarmError
-        Where none does.
+        If none does.
     """
     if not rings:
         hint = "record what follows a quick motion or a blow, or name a stretch with --window"
@@ -139,18 +139,18 @@ def of_windows(found, rings, wishes) -> Study:
 
 
 def by_configuration(made, modes=None):
-    """The shaped modes of each configuration, for a shaper that goes with the joints.
+    """The shaped modes of each configuration, for a shaper that depends on the joints.
 
     Parameters
     ----------
     made : Study
     modes : sequence of int, optional
-        Which; not given: those of the recommended shaper.
+        Indices of the modes; not given: those of the recommended shaper.
 
     Returns
     -------
     list of (ndarray, list of Spread)
-        Configuration [rad] and its modes; empty where no mode depends on the joints.
+        Configuration [rad] and its modes; empty if no mode depends on the joints.
     """
     modes = made.recommendation.chosen.modes if modes is None else modes
     shaped = [f for f in made.families if f.part > MIN_PART]
@@ -180,7 +180,7 @@ def _places(rings):
 
 
 def plain(made, motion=None):
-    """All that was found, ready for JSON: numbers in SI; `motion` as of `yaml_lines`."""
+    """All that was found, ready for JSON, with numbers in SI; `motion` as in `yaml_lines`."""
     names = made.channels.joint_names
     return {
         "channels": list(made.channels.names),
@@ -273,7 +273,7 @@ def yaml_lines(made, motion=None):
     ----------
     made : Study
     motion : list of dict, optional
-        As of `of_trajectory`: the lines are those of the shaper recommended for this motion.
+        As from `of_trajectory`: the lines are those of the shaper recommended for this motion.
     """
     kind, modes, spread, periods = _recommended(made, motion)
     shaped = [made.spreads[k] for k in modes]
@@ -292,7 +292,7 @@ def yaml_lines(made, motion=None):
     if made.channels.joint_names:
         lines.insert(2, f"    joint_names: [{', '.join(made.channels.joint_names)}]")
     if periods:
-        # Upwards: the printed number covers what was found.
+        # Rounded up: the printed number covers what was found.
         up = lambda value, most: min(float(np.ceil(1e3 * value)) / 1e3, most)  # noqa: E731
         spread, periods = up(spread, WIDEST), up(periods, LONGEST)
         lines += [f"    shaper.spread: {spread}", f"    shaper.periods: {periods}"]
@@ -303,7 +303,7 @@ def yaml_lines(made, motion=None):
 
 
 def _recommended(made, motion):
-    """Kind, modes, spread and periods of the shaper that is recommended, for a motion where one is given."""
+    """Kind, modes, spread and periods of the recommended shaper, for a motion if one is given."""
     if not motion:
         chosen = made.recommendation.chosen
         return chosen.kind, chosen.modes, chosen.spread, chosen.periods
@@ -312,7 +312,7 @@ def _recommended(made, motion):
 
 
 def _floats(values):
-    """A list of YAML, every number with a point: ROS takes no integers for floats."""
+    """A YAML list, every number with a decimal point: ROS does not accept integers as floats."""
     return "[" + ", ".join(repr(float(f"{v:.4g}")) for v in values) + "]"
 
 
@@ -412,7 +412,7 @@ def _motion_text(rows, wanted):
 
 
 def of_trajectory(made, trajectory):
-    """What a trajectory excites, now, with each candidate, and with a new time law; see `effect.of_trajectory`.
+    """What a trajectory excites: unshaped, with each candidate, and with a new time law; see `effect.of_trajectory`.
 
     Parameters
     ----------
@@ -422,7 +422,7 @@ def of_trajectory(made, trajectory):
     Raises
     ------
     FlexarmError
-        For a trajectory that is no motion.
+        For a trajectory that is not a motion.
     """
     wanted, joints = made.recommendation.wanted, trajectory.positions.shape[1]
     places = by_configuration(made, range(len(made.spreads)))

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The quickest motion from rest to rest that leaves no more vibration than is wanted, within speed and acceleration.
+r"""Finds the quickest motion from rest to rest that leaves at most the wanted vibration, within speed and acceleration.
 
-The acceleration is linear between N times, with the values a. What is left of a mode is linear in a, so that
+The acceleration is linear between N times, with the values a. The remaining vibration of a mode is linear in a, so
 
 .. math:: \min_{a,\rho}\ \rho \quad\text{with}\quad |a_i| \le a_{max},\; 0 \le v_i \le v_{max},\; v(T) = 0,\;
     s(T) = D,\; \Bigl|\int_0^T a\,e^{p(T-t)}dt\Bigr| \le \rho\,w_p\,\frac{4a_{max}}{|p|}
 
-is a linear programme for each duration T, the modulus bounded by an octagon; the shortest T with :math:`\rho \le 1` is
-found by bisection. :math:`4a_{max}/|p|` is what the trapezoidal motion within the same limits leaves where its four
-corners add up, and :math:`w_p` the residual that is wanted of the mode.
+is a linear programme for each duration T, with the modulus bounded by an octagon. Bisection finds the shortest T with
+:math:`\rho \le 1`. The trapezoidal motion within the same limits leaves :math:`4a_{max}/|p|` if its four corners add
+up, and :math:`w_p` is the wanted residual of the mode.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from scipy.optimize import linprog
 
 from flexarm_dynamics.errors import FlexarmError
 
-#: Times per period of the fastest mode, at least so many in all, and at most.
+#: Times per period of the fastest mode, and their minimum and maximum total number.
 PER_PERIOD, FEWEST, MOST = 10, 40, 160
-#: Poles of each mode that are looked at, and steps of the bisection.
+#: Number of poles of each mode that are evaluated, and steps of the bisection.
 POLES, STEPS = 12, 9
 _SIDES = 8
 #: Timeout of one programme, which takes some 10 ms [s].
@@ -36,7 +36,7 @@ class Move:
     distance : float
         [rad or m]
     velocity, acceleration : float
-        Limits [1/s], [1/s^2] of the same.
+        Limits, in the unit of distance times [1/s], [1/s^2].
     """
 
     distance: float
@@ -44,7 +44,7 @@ class Move:
     acceleration: float
 
     def __post_init__(self):
-        """Refuse what is not above 0.
+        """Refuse values that are not above 0.
 
         Raises
         ------
@@ -59,24 +59,24 @@ class Move:
 
     @property
     def duration(self):
-        """Of the trapezoidal motion, the quickest [s]."""
+        """Duration of the trapezoidal motion, which is the quickest [s]."""
         if self.velocity**2 >= self.distance * self.acceleration:
             return 2.0 * np.sqrt(self.distance / self.acceleration)
         return self.distance / self.velocity + self.velocity / self.acceleration
 
 
 def least_exciting_duration(move, poles, wanted, longer):
-    """Duration of the quickest motion that leaves what is wanted, and what it leaves.
+    """Duration of the quickest motion that leaves at most the wanted residuals, and what it leaves.
 
     Parameters
     ----------
     move : Move
     poles : sequence of ndarray
-        Of each mode, over its spread [1/s].
+        Poles of each mode, over its spread [1/s].
     wanted : sequence of float
-        Of each mode [-].
+        Residual of each mode [-].
     longer : float
-        It may last this much longer than the trapezoidal motion [s].
+        Time by which it may be longer than the trapezoidal motion [s].
 
     Returns
     -------
@@ -88,7 +88,7 @@ def least_exciting_duration(move, poles, wanted, longer):
     Raises
     ------
     FlexarmError
-        Where there is none within the limits.
+        If there is none within the limits.
     """
     thin = [p[:: max(len(p) // POLES, 1)] for p in poles]
     low, high = move.duration, move.duration + longer
@@ -106,7 +106,7 @@ def least_exciting_duration(move, poles, wanted, longer):
 
 
 def solve(move, poles, wanted, duration):
-    """The acceleration at equal times that leaves least, in a given time; None where limits contradict each other.
+    """The acceleration at equal times that leaves least in a given time; None if the limits contradict each other.
 
     Parameters
     ----------
@@ -121,13 +121,13 @@ def solve(move, poles, wanted, duration):
     acceleration : ndarray, shape (N + 1,)
         At times from 0 to the duration [1/s^2].
     residuals : ndarray, shape (m,)
-        Of each mode, its largest [-].
+        Largest residual of each mode [-].
     """
     fastest = max(np.abs(p).max() for p in poles) / (2.0 * np.pi)
     count = int(np.clip(np.ceil(PER_PERIOD * duration * fastest), FEWEST, MOST))
     step = duration / count
     time = step * np.arange(count + 1)
-    # Speed after each step and way at the end, of an acceleration that is linear in between, in units of the limit.
+    # Speed after each step and distance at the end, for piecewise linear acceleration in units of the limit.
     unit = move.acceleration
     speed = step * np.tril(np.ones((count + 1, count + 1)), -1)
     speed[1:, 0] = np.diag(speed, -1).copy() / 2.0
@@ -154,7 +154,7 @@ def solve(move, poles, wanted, duration):
     made = linprog(
         np.append(np.zeros(count - 1), 1.0), A_ub=upper, b_ub=bound, A_eq=equal, b_eq=[0.0, move.distance / unit],
         bounds=[(-1.0, 1.0)] * (count - 1) + [(0.0, None)],
-        # The dual simplex method cycles where nothing need be left, in times that are long enough.
+        # The dual simplex method cycles if the residual can be zero, that is, if the time is long enough.
         method="highs-ipm", options={"time_limit": PATIENCE},
     )  # fmt: skip
     if made.x is None:
@@ -166,7 +166,7 @@ def solve(move, poles, wanted, duration):
 
 
 def _kernel(poles, time, step, duration):
-    """What each hat of a piecewise linear acceleration leaves of each pole, shape (k, N + 1)."""
+    """What each hat function of a piecewise linear acceleration leaves at each pole, shape (k, N + 1)."""
     half = poles * step / 2.0
     hat = step * (np.sinh(half) / half) ** 2
     return hat[:, None] * np.exp(np.multiply.outer(poles, duration - time))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a recording rings freely, and which modes ring there."""
+"""Finds the windows in which a recording rings freely, and the modes that ring in them."""
 
 from dataclasses import dataclass
 
@@ -11,36 +11,36 @@ from ..identification.recording import SIGNALS, kind_of
 from ..recordings import rest
 from .fit import HIGHEST, Fit, fit
 
-#: What rings while the joints rest, and what stands in for it, the first that there is.
+#: Quantities that ring while the joints rest, and their substitutes, of which the first available is used.
 RINGING = ("strain", "amplitude", "linear_acceleration", "angular_velocity")
 INSTEAD = ("velocity", "position", "torque", "current")
 #: The joints move if one goes farther than this [rad or m].
 MOVES = 5e-3
-#: A fit counts if it explains this fraction of some channel's variance.
+#: A fit is used if it explains this fraction of some channel's variance.
 EXPLAINED = 0.8
-#: Of the envelope without joints: its block [s]; what it must be above at the begin and at the end of a window, over
-#: the quietest fiftieth; by how much more than before a blow is one, and a window over [-].
+#: For the envelope without joints: its block [s]; its minimum at the begin and at the end of a window, over the
+#: quietest fiftieth [-]; and its increase that counts as a blow and ends a window [-].
 BLOCK, BEGIN, END, RISE = 0.25, 2.0, 1.3, 1.6
-#: A shorter window is none [s].
+#: A shorter window does not count [s].
 SHORTEST = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """What may ring, of a recording.
+    """The channels of a recording that may ring.
 
     Attributes
     ----------
     names, quantities : tuple of str
         Of each of the c channels.
     values : ndarray, shape (s, c)
-        SI; every channel has a value at each sample.
+        Values in SI; every channel has a value at each sample.
     start, period : float
         [s]
     position : ndarray, shape (s, n)
         Of the joints [rad].
     joint_names : tuple of str
-        Of the n joints.
+        Names of the n joints.
     """
 
     names: tuple
@@ -61,7 +61,7 @@ class Channels:
         Raises
         ------
         FlexarmError
-            Where there are none.
+            If there are none.
         """
         first, last = (int(np.ceil((t - self.start) / self.period - 0.5)) for t in (begin, end))
         part = slice(max(first, 0), min(max(last, 0), len(self.values)))
@@ -91,18 +91,18 @@ class Window:
 
 
 def channels(recording, quantities=None) -> Channels:
-    """What may ring, of a recording.
+    """The channels of a recording that may ring.
 
     Parameters
     ----------
     recording : Recording
     quantities : sequence of str, optional
-        Of `SIGNALS`; not given: all of `RINGING` that there is, or the first of `INSTEAD`.
+        Of `SIGNALS`; not given: all available ones of `RINGING`, or the first available one of `INSTEAD`.
 
     Raises
     ------
     FlexarmError
-        Where no channel of these has all its values.
+        If no channel of these has all its values.
     """
     found = {q: list(_of(recording, q)) for q in quantities or SIGNALS}
     if quantities is None:
@@ -120,7 +120,7 @@ def channels(recording, quantities=None) -> Channels:
 
 
 def _of(recording, quantity):
-    """Name and values of each channel of a quantity that moves, and misses none."""
+    """Name and values of each channel of a quantity that varies and has no missing values."""
     values = getattr(recording, quantity)
     if values is None:
         return
@@ -132,7 +132,7 @@ def _of(recording, quantity):
 
 
 def free(found, recording):
-    """Stretches in which nothing moves the arm: where its joints rest, or where an envelope falls.
+    """Stretches in which nothing moves the arm: its joints rest, or an envelope falls.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def free(found, recording):
 
 
 def falling(values, period):
-    """Stretches of `values` (s, c), a row each `period` [s], whose envelope falls from above the quietest blocks."""
+    """Stretches of `values` (s, c), a row per `period` [s], whose envelope falls from above the quietest blocks."""
     block = max(round(BLOCK / period), 2)
     count = len(values) // block
     if count < 4:
@@ -175,7 +175,7 @@ def falling(values, period):
         least = min(least, now)
     if begin is not None:
         parts.append((begin, count))
-    # The block with the blow in it is none of free ringing.
+    # The block with the blow does not belong to the free ringing.
     return [
         slice((a + 1) * block, b * block)
         for a, b in parts

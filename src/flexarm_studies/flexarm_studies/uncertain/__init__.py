@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plants that are not the controller's model, runs of controllers on them, and baselines tuned for them."""
+"""Defines plants that are not the controller's model, runs controllers on them, and tunes baselines for them."""

@@ -1,32 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Baselines for an arm and its motion, tuned on what a design has: arm file, uncertain set, rate, delay.
+r"""Tunes baselines for an arm and its motion with the data of a design: arm file, uncertain set, rate, delay.
 
-The uncertain set is the arm at start, middle and end of its motion with `PAYLOADS` times its payload and one mode more,
-linearised, sampled at `RATE`, its torque at once and one sample late; of it the part that torque reaches.
+The uncertain set is the arm at start, middle and end of its motion, with `PAYLOADS` times its payload and one mode
+more. The arm is linearised and sampled at `RATE`, with its torque at once and one sample late. Only the part that
+torque reaches is used.
 
 - Joint PID, with the weight and friction of the rigid arm along the reference, and each joint's own inertia times its
-  acceleration. The integral is there without gravity, too: a PD alone sticks where friction lets it. Its reference is
-  shaped (ZVD or EI) for the modes that ring under it at the motion's end. Gains must be stable on the whole set, and
-  have the shortest settling time of the linear arm on the shaped motion, worst of all payloads: by its poles alone a
-  PID would be so soft that it leaves the modes' own damping as it is.
-- Joint PID with strain feedback: the same PID without a shaper, and of each joint that bends a link with a gauge, the
-  moment :math:`\mu` that this link's innermost gauge shows, and its rate, about the moment :math:`\mu_r` of the
-  reference's motion. Both gains are tuned with the PID's, by the same measure (Luo, Direct strain feedback control of
-  flexible robot arms, IEEE Trans. Automatic Control 38, 1993; there the rate alone):
+  acceleration. The integral is also used without gravity, because a PD alone sticks where friction lets it. The
+  reference is shaped (ZVD or EI) for the modes that ring under the PID at the motion's end. Gains must be stable on the
+  whole set. They have the shortest settling time of the linear arm on the shaped motion, for the worst of all payloads.
+  If only its poles were optimised, the PID would be so soft that it does not change the modes' own damping.
+- Joint PID with strain feedback: the same PID without a shaper. For each joint that bends a link with a gauge, it feeds
+  back the moment :math:`\mu` that this link's innermost gauge shows, relative to the moment :math:`\mu_r` of the
+  reference's motion, and its rate. Both gains are tuned with those of the PID, by the same measure (Luo, Direct strain
+  feedback control of flexible robot arms, IEEE Trans. Automatic Control 38, 1993; there only the rate is used):
 
 .. math:: u = u_{PID} + \kappa\,(\mu - \mu_r) + \lambda\,\dot\mu / \omega_1 .
 
-- Full-state LQR: `comparison.baselines.FullStateLqr`, with the Kalman filter that gives it the state, tuned together by
-  the poles :math:`p` of all these loops at once. With the first locked frequency :math:`\omega_1` it minimises
+- Full-state LQR: `comparison.baselines.FullStateLqr`, and the Kalman filter that gives it the state. Both are tuned
+  together by the poles :math:`p` of all these loops at once. With the first locked frequency :math:`\omega_1` the
+  tuning minimises
 
 .. math:: \max_{cases,\,p} d(p) + c\,\overline{\max(d(p),\,-1)}, \qquad
     d(p) = \frac{\mathrm{Re}\,p}{\omega_1}\max\Bigl(1, \frac{|p|}{b\,\omega_1}\Bigr).
 
-plus the logarithm of how many times too large the sensors' noise in the torque is: it may be as large as in a design
-(`NOISIEST`). Without this bound the gains are so high that an encoder's count takes a tenth of the torque, and counts
-alone make the loop oscillate. Poles beyond b = `BAND` count less: no gain moves the decay of the highest modes, but the
-others' it may. The second term is a tie-break (c = `TIE`): of two gains with the same slowest pole, the one that damps
-the others better.
+plus the logarithm of the factor by which the sensors' noise in the torque is too large; it may be as large as in a
+design (`NOISIEST`). Without this bound the gains are so high that an encoder's count takes a tenth of the torque, and
+counts alone make the loop oscillate. Poles beyond b = `BAND` count less, because no gain changes the decay of the
+highest modes, only that of the others. The second term is a tie-break (c = `TIE`): of two gains with the same slowest
+pole, it prefers the one that damps the others better.
 """
 
 from dataclasses import dataclass
@@ -56,32 +58,33 @@ from .trial import TOLERANCE
 PAYLOADS = (0.7, 1.0, 1.3)
 #: Samples per second [Hz].
 RATE = 500.0
-#: Of flexarm's supervision they have none: a false alarm is not theirs. `trial.MAX_ERROR` ends a run.
+#: The baselines run without flexarm's supervision, because false alarms must not count against them. `trial.MAX_ERROR`
+#: ends a run.
 WATCH = UNWATCHED | {"observer.plausibility": False, "strain_limit": 1.0}
 #: Evaluations per tuning: of poles, and of settling times.
 BUDGET, PID_BUDGET = 150, 120
-#: Slowest pole that counts as stable, in first locked frequencies [-]; settling times end here [periods].
+#: Slowest pole that counts as stable, in first locked frequencies [-]; largest settling time [periods].
 MARGIN, NEVER = 2e-3, 8.0
 #: Weight of the tie-break [-].
 TIE = 0.05
-#: Poles beyond so many times the first locked frequency count less [-].
+#: Poles beyond this many times the first locked frequency count less [-].
 BAND = 3.0
-#: A mode with less of the largest mode's controllability is out of the torques' reach [-].
+#: Torque does not reach a mode with less than this fraction of the largest mode's controllability [-].
 REACHED = 1e-7
 
 
 @dataclass(frozen=True)
 class Linear:
-    """An arm at rest, linearised, of which only the part is kept that torque reaches.
+    """An arm at rest, linearised; only the part that torque reaches is kept.
 
     Attributes
     ----------
     A : ndarray, shape (N, N)
-        Of this part.
+        System matrix of this part.
     Phi, Gamma : ndarray, shape (N, N), (N, n)
-        Of one sample, the torque held.
+        Transition over one sample, with held torque.
     X : ndarray, shape (2 (n + m), N)
-        Orthonormal: the state is X times this part's.
+        Orthonormal: the state is X times the state of this part.
     """
 
     A: np.ndarray
@@ -104,7 +107,7 @@ def linear(arm_model, q, rate=RATE):
 
 
 class Task:
-    """An arm with what its baselines are tuned for.
+    """An arm with everything for which its baselines are tuned.
 
     Attributes
     ----------
@@ -117,7 +120,7 @@ class Task:
     reach : float
         Whole length [m].
     inertia : ndarray, shape (n,)
-        Of the rigid arm about each joint, the mean of both ends [kg m^2].
+        Inertia of the rigid arm about each joint, the mean of both ends [kg m^2].
     """
 
     def __init__(self, case):
@@ -143,7 +146,7 @@ class Task:
 
     @cached_property
     def plants(self):
-        """The uncertain set: `Linear`, of the places in turn."""
+        """The uncertain set: each a `Linear`, place by place."""
         return [linear(each, q) for each in self.models for q in self.places]
 
     @cached_property
@@ -158,15 +161,15 @@ class Task:
 
     @cached_property
     def seen(self):
-        """What the observer sees of a plant with one mode more: (n + m, n + modes of that), of its q and delta."""
+        """What the observer sees of q and delta of a plant with one mode more: (n + m, n + modes of that plant)."""
         n, rows = self.model.n_joints, gauge_rows(self.models[1], self.model.arm.gauges)
         return block_diag(np.eye(n), self.strain_map.inverse_without(()) @ rows)
 
     @cached_property
     def loaded(self):
-        """Of each payload, at the end: the `Linear`, the tip by the state (3, ...), and what torque is missing.
+        """For each payload, at the end: the `Linear`, the tip by the state (3, ...), and the missing torque.
 
-        That is what holds this payload, beyond the weight of the rigid arm that the controller knows, (n,) [N m].
+        The missing torque holds this payload, beyond the weight of the rigid arm that the controller knows, (n,) [N m].
         """
         found, q = [], self.ends[1]
         n = q.size
@@ -180,7 +183,7 @@ class Task:
         return found
 
     def worst(self, found):
-        """What is minimised, of the poles of all cases; and their largest real part; both in omega [-]."""
+        """The measure to minimise, from the poles of all cases; and their largest real part; both in omega [-]."""
         poles = np.concatenate(found) / self.omega
         decay = poles.real * np.maximum(1.0, np.abs(poles) / BAND)
         return float(decay.max() + TIE * np.maximum(decay, -1.0).mean()), float(poles.real.max())
@@ -195,9 +198,9 @@ def poles(plant, K, integral):
 
 
 def pid_loop(plant, K, integral, late=1):
-    """Sampled loop of a `plant` under PID: of the part, the last torque, the integral's torque.
+    """Sampled loop of a `plant` under PID, with the states of the part, the last torque, and the integral's torque.
 
-    u = -`K` x - the sum of `integral` (n,) times the joint angles and the period; it acts `late` samples late, 0 or 1.
+    u = -`K` x - the sum of `integral` (n,) times the joint angles and the period; u acts `late` samples late, 0 or 1.
     """
     Phi, Gamma, X = plant.Phi, plant.Gamma, plant.X
     N, n = Gamma.shape
@@ -261,13 +264,13 @@ def pid_gains(task, values):
 def pid(task, kind):
     """Tuned gains of the joints' PID for a `task`, with a shaper of a `kind` or None, and its settling time [periods].
 
-    Refused where no gains are stable on the whole uncertain set.
+    Refused if no gains are stable on the whole uncertain set.
     """
     return tuned_pid(task, _pid_free(task), pid_gains, kind)
 
 
 def tuned_pid(task, free, gains_of, kind=None):
-    """As `pid`, of the `free` numbers, from which `gains_of` makes the gains of a `task`."""
+    """As `pid`, for the `free` numbers, from which `gains_of` makes the gains of a `task`."""
 
     def unstable(values):
         gains = gains_of(task, values)
@@ -294,7 +297,7 @@ def tuned_pid(task, free, gains_of, kind=None):
 def pid_feedback(task, gains, plant):
     """Feedback of a PID, without the integral, of the state (q, delta, qd, delta_d) of a `plant` of the `task`.
 
-    The moment of strain feedback is what the observer makes of the gauges: `Task.seen`, of a plant with more modes.
+    The moment of strain feedback is the observer's estimate from the gauges: `Task.seen`, for a plant with more modes.
     """
     size, n = len(plant.X), gains["p"].size
     K = np.zeros((n, size))
@@ -309,7 +312,7 @@ def pid_feedback(task, gains, plant):
 
 
 def train_of(task, gains, kind):
-    """The `Shaper` of a `kind` for modes that ring under PID `gains` at the end of a `task`; None where none rings.
+    """The `Shaper` of a `kind` for modes that ring under PID `gains` at the end of a `task`; None if none rings.
 
     None also without a `kind`.
     """
@@ -335,8 +338,8 @@ def _reference(task, train, times):
 def settling(task, gains, train):
     """Settling time of a PID on the motion of a `task`, shaped by a `train`, from its unshaped end on [periods].
 
-    The arm is the linear one at the motion's end, the worst of `PAYLOADS`; the tip is as in `trial`. Beyond `NEVER`
-    periods: how often the tolerance it is still away, as a logarithm, is added.
+    The arm is the linear one at the motion's end, with the worst of `PAYLOADS`; the tip is as in `trial`. If the tip is
+    not settled after `NEVER` periods, the logarithm of its distance over the tolerance is added.
     """
     times = np.arange(0.0, task.profile.duration + NEVER * task.case.period, 1.0 / RATE)
     r, rd, rdd = _reference(task, train, times)
@@ -347,7 +350,7 @@ def settling(task, gains, train):
         Gamma, X = plant.Gamma, plant.X
         N, n = Gamma.shape
         loop = pid_loop(plant, pid_feedback(task, gains, plant), gains["i"])
-        # What comes in: the reference, late as the feedback; its integral; the load that the weight does not carry.
+        # Inputs: the reference, as late as the feedback; its integral; the load beyond the known weight.
         inputs = np.zeros((len(times), N + 2 * n))
         inputs[:, :N] = -Gamma @ load
         inputs[:, N : N + n] = push + gains["i"] * r / RATE
@@ -367,7 +370,7 @@ def settling(task, gains, train):
 
 
 def _response(loop, inputs, start, outputs):
-    """Outputs (k, 3) of s' = loop s + input from a `start`, mode by mode."""
+    """Outputs (k, 3) of s' = loop s + input from a `start`, computed mode by mode."""
     values, vectors = np.linalg.eig(loop)
     drive = np.linalg.solve(vectors, inputs.T.astype(complex))
     first = np.linalg.solve(vectors, start.astype(complex))
@@ -396,15 +399,15 @@ def _given():
 # PID with strain feedback ------------------------------------------------------------------------
 
 
-#: Which component of a joint's axis a gauge's direction bends about, and the sign of the moment.
+#: Component of a joint's axis about which a gauge's direction bends, and sign of the moment.
 ABOUT = {"y": (2, 1.0), "z": (1, -1.0), "twist": (0, 1.0)}
 
 
 def moment_rows(arm_model):
     """Rows (n, m) of a model, `arm_model`: moment on each joint that its link's innermost gauge shows [N m].
 
-    With a section's stiffness EI the moment is EI y'', a gauge's strain -c y''; twist is GJ theta'. Zeros where the
-    joint's own link has no gauge that shows it. The joint turns with its link, so that their axes agree.
+    With a section's stiffness EI the moment is EI y'', a gauge's strain -c y''; twist is GJ theta'. Zeros if the
+    joint's own link has no gauge that shows it. The joint turns with its link, so their axes agree.
     """
     arm, rows = arm_model.arm, np.zeros((arm_model.n_joints, arm_model.n_modes))
     for row, joint, link in zip(rows, arm.joints, arm.links, strict=True):
@@ -469,7 +472,7 @@ def strain_pid(case):
 
 
 class Lqr(FullStateLqr):
-    """`FullStateLqr` with a gain that was found elsewhere."""
+    """`FullStateLqr` with a given gain."""
 
     def __init__(self, arm_model, K):
         Baseline.__init__(self, arm_model)
@@ -520,7 +523,7 @@ def kalman_parameters(task, values):
 
 
 def kalman_gain(task, place, parameters):
-    """Steady gain L (N, n + m) of the observer at one of the places, for the part that torque reaches."""
+    """Steady-state gain L (N, n + m) of the observer at one of the places, for the part that torque reaches."""
     part, m = task.nominal[place], task.model.n_modes
     n = task.model.n_joints
     # Unknown forces act through the mass matrix.
@@ -550,7 +553,7 @@ def lqg_poles(task, K, parameters):
 
 
 def _lqg_loop(task, plant, own, L, K, late):
-    """Sampled loop of a plant under LQG: of the part, the estimate, the last torque; as `pid_loop`."""
+    """Sampled loop of a plant under LQG, with the states of the part, the estimate, the last torque; as `pid_loop`."""
     N, M, n = len(plant.Phi), len(own.Phi), task.model.n_joints
     seen = L @ task.seen @ plant.X[: task.seen.shape[1]]
     loop = np.zeros((N + M + n,) * 2)
@@ -572,9 +575,9 @@ def reading_covariance(task):
 
 
 def lqg_noise(task, K, parameters):
-    """Rms torque of the sensors' noise under LQR `K` and the filter of `parameters`, over the torque limit [-].
+    """Rms torque due to the sensors' noise under LQR `K` and the filter of `parameters`, over the torque limit [-].
 
-    The largest of all joints, of the loop at the end of a `task`; infinite where that is unstable.
+    It is the largest of all joints, for the loop at the end of a `task`; infinite if that loop is unstable.
     """
     place = len(task.places) - 1
     own, L = task.nominal[place], kalman_gain(task, place, parameters)
@@ -615,7 +618,7 @@ def full_state_lqr(case):
     K, filtered, _ = lqr(task_of(case))
     observer = {f"observer.{name}": value for name, value in filtered.items()}
     given = IDLE | WATCH | observer | {"observer.type": "kalman", "rate": RATE}
-    given["publish_joint_velocity"] = False  # the filter that is tuned has positions alone
+    given["publish_joint_velocity"] = False  # the tuned filter uses positions alone
     return Setup(given, lambda arm: Lqr(arm, K))
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controllers that are tried on the uncertain set, by name; each makes its `Setup` from a `RandomArm` or `ArmTask`.
+"""Makes the controllers for the uncertain set, by name; each makes its `Setup` from a `RandomArm` or `ArmTask`.
 
-``shipped`` is the controller file that flexarm has for a shipped arm. ``default`` and ``preview`` are what
-docs/tutorial/own_arm.md tells a user to type, with one set of gains for every arm. ``designed_preview`` is what
-``flexarm design`` makes of the arm file, for 500 Hz and 2 ms of delay, at start, middle and end of the motion, as the
-baselines are tuned; ``designed`` has ``feedforward: model``. The baselines are tuned for each arm.
+``shipped`` is the controller file that flexarm has for a shipped arm. ``default`` and ``preview`` are the commands of
+docs/tutorial/own_arm.md, with one set of gains for every arm. ``designed_preview`` is the result of ``flexarm design``
+for the arm file, for 500 Hz and 2 ms of delay, at start, middle and end of the motion, like the baselines. ``designed``
+has ``feedforward: model``. The baselines are tuned for each arm.
 """
 
 from functools import partial
@@ -25,7 +25,7 @@ def _tutorial(feedforward, case):
 
 
 def _designed(feedforward, case):
-    """From the cache of designs where it is there."""
+    """Take it from the cache of designs if it is there."""
     start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
     settings = Settings(rate=RATE, delay=DELAY, configurations=(middle, start, end))
     found = default(case.read(), settings, Uncertainty())
@@ -45,9 +45,9 @@ CONTROLLERS = {
     "pid_strain": strain_pid,
     "lqr": full_state_lqr,
 }
-#: With what the others are compared.
+#: Controllers with which the others are compared.
 BASELINES = ("pid", "pid_zv", "pid_zvd", "pid_ei", "pid_strain", "lqr")
-#: What the names mean, for tables.
+#: Meaning of the names, for tables.
 WORDS = {
     "shipped": "the controller file that is shipped for the arm",
     "default": "the nodes' composite control with `model_following`",

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How quiet an arm can get: links ring while friction holds the joints, and no torque reaches some modes.
+r"""Computes how quiet an arm can get: links ring while friction holds the joints, and no torque reaches some modes.
 
-With the joints held, (2) of the mode phi at the frequency omega leaves on the joints the torque
+With the joints held, (2) gives the torque of the mode phi at the frequency omega on the joints
 
 .. math:: \tau = (K_1 - \omega^2M_{12})\,\phi\,a
 
-for the amplitude a. As long as friction f_c is larger at every joint, none turns, and the links ring with their own
-damping, unless the control adds torque beyond the friction. That is so up to the rms of the tip
+for the amplitude a. As long as the friction f_c is larger at every joint, no joint turns, and the links ring with their
+own damping, unless the control adds torque beyond the friction. This holds up to the rms of the tip
 
 .. math:: r = \frac{|J\phi|}{\sqrt2}\,\min_j\frac{f_{cj}}{|\tau_j|/a}
 
-with the tip's displacement J phi. Where tau is zero no torque reaches the mode, and r is infinite.
+with the tip's displacement J phi. If tau is zero, no torque reaches the mode, and r is infinite.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-#: Below this torque of a mode, over that of a mode which moves with the hub, no torque reaches it [-].
+#: A mode whose torque, over that of a mode that moves with the hub, is below this is not reached by torque [-].
 REACHED = 1e-6
 #: Largest amplitude of a mode for the derivative of the tip [m], [rad].
 STEP = 1e-6
@@ -66,13 +66,13 @@ def ringing(plant, q):
     squares, shapes = eigh(terms.K2, terms.M[n:, n:])
     for square, shape in zip(squares, shapes.T, strict=True):
         torque = np.abs(terms.K1 @ shape - square * (terms.M[:n, n:] @ shape))
-        # The shape has a kinetic energy of one half at the rate one: so has a hub that turns at 1/sqrt(M_jj).
+        # The shape has a kinetic energy of one half at the rate one, like a hub that turns at 1/sqrt(M_jj).
         reached = bool(np.any(torque > REACHED * square * hubs))
         step = STEP / np.abs(shape).max()
         tip = np.linalg.norm(plant.tip_position(q, sag + step * shape) - rest) / step
         held = np.inf
         if reached:
-            # A joint that the mode leaves alone turns at no amplitude.
+            # A joint on which the mode does not act turns at no amplitude.
             bears = np.divide(friction, torque, out=np.full(n, np.inf), where=torque > 0.0)
             held = float(bears.min() * tip / (np.sqrt(2.0) * plant.arm.reach))
         found.append(Ringing(float(np.sqrt(square)) / (2.0 * np.pi), reached, held))

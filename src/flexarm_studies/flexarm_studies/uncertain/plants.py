@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The uncertain set: how a simulated arm differs from the model that its controller has.
+"""Defines the uncertain set: how a simulated arm differs from the model of its controller.
 
-`compare`, `robustness` and `arms` judge controllers on these plants. A controller that was only run on its own model
-has shown nothing about the arm: the *nominal* plant is there for comparison.
+`compare`, `robustness` and `arms` judge controllers on these plants. A run on the controller's own model shows nothing
+about the real arm: the *nominal* plant is there for comparison.
 
-The accurate level has links that keep their length (geometric stiffening) and finite slope. Only the general model
-has it: an arm file with the paper's equations is simulated there as the chain of the same data.
+The accurate level has links that keep their length (geometric stiffening) and finite slope. Only the general model has
+this level, so an arm file with the paper's equations is simulated as the chain of the same data.
 """
 
 from dataclasses import dataclass, replace
@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import ModelError
 
-#: Samples per second where a variant wants few, and how late torque acts where it wants delay [Hz], [s].
+#: Samples per second of a variant with a low rate [Hz], and delay of the torque in a variant with delay [s].
 SLOW_RATE, DELAY = 500.0, 0.002
-#: Friction that is added: Coulomb, and viscous at 1 rad/s, as fractions of the joint's torque limit [-].
+#: Added friction: Coulomb, and viscous at 1 rad/s, as fractions of the joint's torque limit [-].
 FRICTION = 0.02
 #: Sensors of arms whose file states no noise: rms strain of a gauge, encoder counts per turn.
 STRAIN_NOISE, COUNTS = 5e-7, 2**16
@@ -32,13 +32,13 @@ class Variant:
     more_modes : int
         Modes beyond the model's in every direction of every link.
     accurate : bool
-        Links that keep their length, and finite slope.
+        Whether links keep their length, with finite slope.
     friction : float
-        Added, see `FRICTION` [-].
+        Added friction, see `FRICTION` [-].
     delay : float
         From the measurement until the torque acts [s].
     sensors : bool
-        Noise and counts, and no measured velocity; otherwise sensors are ideal.
+        Whether sensors have noise and counts, and no velocity is measured; otherwise they are ideal.
     rate : float or None
         Samples per second; None: the controller's [Hz].
     """
@@ -54,7 +54,7 @@ class Variant:
     rate: float | None = None
 
 
-#: The plant that is the model; all others differ from it.
+#: The plant that equals the model; all others differ from it.
 NOMINAL = "nominal"
 VARIANTS = {
     NOMINAL: Variant(more_modes=0, accurate=False),
@@ -81,7 +81,8 @@ def plant_of(arm, variant):
     Raises
     ------
     ModelError
-        Where the arm can't differ so: friction needs finite torque limits, more modes their measured frequencies.
+        If the arm can't differ in this way: friction needs finite torque limits, and more modes need their measured
+        frequencies.
     """
     plant = scaled(arm, variant.payload, variant.stiffness, variant.damping)
     if arm.most_modes and variant.more_modes:
@@ -94,7 +95,7 @@ def plant_of(arm, variant):
 
 
 def names_for(arm, names=tuple(VARIANTS)):
-    """Those of the `names` that an arm can be simulated as, and that differ, in their order."""
+    """Those of the `names` as which an arm can be simulated and that differ from it, in their order."""
     return tuple(name for name in names if _possible(arm, VARIANTS[name]))
 
 
@@ -122,7 +123,7 @@ def _rubbing(joint, fraction):
 
 
 def with_noise(arm):
-    """The arm with noise and counts where its file states none."""
+    """The arm with noise and counts if its file states none."""
     gauges = tuple(replace(g, noise=g.noise or STRAIN_NOISE) for g in arm.gauges)
     joints = tuple(replace(j, encoder_counts=j.encoder_counts or COUNTS) for j in arm.joints)
     return replace(arm, gauges=gauges, joints=joints)

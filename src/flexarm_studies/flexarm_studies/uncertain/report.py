@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs on uncertain plants show: nominal, median and worst of each controller, who wins, and in words.
+"""Reports runs on uncertain plants: nominal, median and worst of each controller, and who wins, also in words.
 
-A run that is lost or refused, or does not settle, is worse than all others. The median is that of a run: with an even
-number of plants the worse one of the two in the middle. Nominal is the plant that is the model; it is in neither.
+A run that is lost or refused, or does not settle, is worse than all others. The median is a value of one run: with an
+even number of plants, the worse of the two in the middle. Nominal is the plant that equals the model; median and worst
+do not include it.
 """
 
 from collections import Counter
@@ -11,22 +12,23 @@ from .. import markdown
 from .controllers import BASELINES, WORDS
 from .plants import NOMINAL
 
-#: What is compared: key of a row, words, factor, and how much worse is still equal: a fraction, and a number.
+#: Compared measures: key of a row, words, factor, and the difference that still counts as equal: a fraction, and a
+#: number.
 MEASURES = (
     ("peak_joint_error_deg", "peak joint error [deg]", 1.0, 0.01, 0.0),
     ("settling_s", "settling time [s]", 1.0, 0.01, 0.01),
     ("residual_tip", "tip residual [1e-3 reach]", 1e3, 0.01, 1e-3),
 )
 OVER = (NOMINAL, "median", "worst")
-#: Words for a run without a number, from the better to the worse one.
+#: Words for a run without a number, from better to worse.
 NOT_SETTLED, LOST, REFUSED = "not settled", "lost", "refused"
 ORDER = (NOT_SETTLED, LOST, REFUSED)
-#: So many reasons are listed per controller.
+#: Number of reasons that are listed per controller.
 REASONS = 2
 
 
 def cell(row, name, factor):
-    """A measure of a run as (rank, number, word): smaller is better, the number None where there is a word."""
+    """A measure of a run as (rank, number, word): smaller is better; the number is None if there is a word."""
     word = next((w for w in (REFUSED, LOST) if w in row), None)
     if word is None and row[name] is None:
         word = NOT_SETTLED
@@ -45,7 +47,7 @@ def rows_of(rows):
 
 
 def _over(rows, controller, over, name, factor):
-    """Cell of a controller, nominal or over the plants; None where there is no such run."""
+    """Cell of a controller, nominal or over the plants; None if there is no such run."""
     own = [r for r in rows if r["controller"] == controller]
     own = [r for r in own if (r["variant"] == NOMINAL) == (over == NOMINAL)]
     found = sorted((cell(r, name, factor) for r in own), key=_rank)
@@ -59,7 +61,7 @@ def _rank(found):
 
 
 def winners(cells, fraction, number):
-    """Controllers with the best cell, or as good but for `fraction` and `number`; none where no cell has a number."""
+    """Controllers with the best cell, or equally good within `fraction` and `number`; none if no cell has a number."""
     values = {c: found[1] for c, found in cells.items() if found and found[1] is not None}
     if not values:
         return []
@@ -88,7 +90,7 @@ def _text(found):
 
 
 def verdicts(rows):
-    """Sentences: in which rows a baseline wins, and against what; in which it does not; what is lost or refused."""
+    """Sentences: in which rows a baseline wins, and against what; in which it does not; lost or refused runs."""
     found = list(rows_of(rows))
     if not any(c in BASELINES for _, cells, _ in found for c in cells):
         return [*_worst_plants(rows), *_reasons(rows)]
@@ -110,7 +112,7 @@ def verdicts(rows):
 
 
 def _worst_plants(rows):
-    """On which plant each controller settles last."""
+    """The plant on which each controller takes longest to settle."""
     for controller in dict.fromkeys(r["controller"] for r in rows):
         own = [r for r in rows if r["controller"] == controller and r["variant"] != NOMINAL]
         if own:
@@ -137,6 +139,6 @@ def bullets(lines):
 
 
 def legend(rows):
-    """One line: what the controllers' names mean."""
+    """One line with the meaning of the controllers' names."""
     names = dict.fromkeys(row["controller"] for row in rows)
     return "; ".join(f"{name}: {WORDS[name]}" for name in names if name in WORDS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of a controller on uncertain plants: set up once for an arm, and a row for each plant."""
+"""Runs a controller on uncertain plants: it is set up once for an arm, and gives a row for each plant."""
 
 import time
 
@@ -10,7 +10,7 @@ from .plants import VARIANTS
 
 
 def key(arm, controller, variant):
-    """Of a run, in a file of rows."""
+    """Key of a run in a file of rows."""
     return f"{arm}/{controller}/{variant}"
 
 
@@ -21,10 +21,10 @@ def rows(case, label, controller, make, variants, seed=0):
     ----------
     case : RandomArm or ArmTask
     label : str or int
-        Of the arm in keys.
+        Label of the arm in keys.
     controller : str
     make : callable
-        From the case: its `Setup`. A FlexarmError that it raises refuses all variants.
+        Makes the `Setup` from the case. A FlexarmError that it raises refuses all variants.
     variants : sequence of str
     seed : int
         Of the noise.
@@ -33,7 +33,7 @@ def rows(case, label, controller, make, variants, seed=0):
     -------
     list of dict
         Rows, each with ``sample`` (its `key`), ``arm``, ``controller``, ``variant``, ``seconds`` of computing,
-        what the setup's design was ``found`` to do, and what `trial.run` returns.
+        properties ``found`` of the setup's design, and what `trial.run` returns.
     """
     begin, refused, setup = time.monotonic(), None, None
     try:

@@ -1,24 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""One run of an arm on a plant that is not the controller's model, and the numbers by which it is judged.
+r"""Runs an arm on a plant that is not the controller's model, and computes the numbers by which it is judged.
 
 The plants are those of `plants.VARIANTS`.
 
-Where the tip should end up: where the plant's tip rests, bent by the plant's own weight, with every joint exactly at
-the end of the reference. A heavier payload sags more, which joint torques can't and need not change: that is no
-error. Joint errors and vibration are. The tip is settled when it is within `TOLERANCE` of the reach from there, and
-stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`.
+The tip should come to rest where the plant's tip rests, bent by the plant's own weight, with every joint exactly at the
+end of the reference. A heavier payload sags more. Joint torques can't change this and need not: it is not an error.
+Joint errors and vibration are errors. The tip is settled when it is within `TOLERANCE` of the reach from that place,
+and stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`.
 
-Integration: dop853 where a few substeps are short enough for the highest mode, and for the friction of light hubs: it
-damps a joint that turns around at the rate :math:`f_cH/v_s`, with the inverse H of the mass matrix. Else the implicit
-method in substeps of `STEP`: a mode of 625 Hz turns by 0.1 rad in one, and it takes faster ones out, as the current
-loop of a drive does. Those would cost a hundred substeps per sample, and the table a day. The steps are shorter where
-Coulomb friction would move a light hub farther than `KICK` in one: it turns around at the end of a step alone. In
-longer steps joints hunt that come to rest: one by 0.25 deg in implicit steps of 0.25 ms, not in steps of 0.18 ms;
-another one by 0.09 deg in steps of 2 ms of dop853, by 0.04 deg in steps of 1 ms, not in steps of 0.67 ms.
+Integration: dop853 is used if a few substeps are short enough for the highest mode and for the friction of light hubs.
+Friction damps a joint that reverses at the rate :math:`f_cH/v_s`, with the inverse H of the mass matrix. Otherwise the
+implicit method is used in substeps of `STEP`. The phase of a mode of 625 Hz changes by 0.1 rad in one substep; the
+method removes faster modes, like the current loop of a drive. An explicit method would take a hundred substeps per
+sample for these, and a day for the table. The steps are shorter if Coulomb friction would move a light hub farther than
+`KICK` in one, because friction reverses only at the end of a step. In longer steps, joints that come to rest hunt: one
+by 0.25 deg in implicit steps of 0.25 ms, but not in steps of 0.18 ms; another one by 0.09 deg in steps of 2 ms of
+dop853, by 0.04 deg in steps of 1 ms, but not in steps of 0.67 ms.
 
-What the loads of a motion add to the stiffness of a bent arm the implicit method takes explicitly: in steps that are
-too long it makes a fast mode grow that decays. Such an arm is lost, by the method and not by its control. So a run
-that is lost is repeated in steps `SHORTER` times as short, and the arm is lost where it is lost then, too.
+The implicit method treats the stiffness that the loads of a motion add to a bent arm explicitly. If its steps are too
+long, a fast mode that should decay grows. Such an arm is lost by the method and not by its control. So a lost run is
+repeated in steps `SHORTER` times as short, and the arm counts as lost if it is lost then, too.
 """
 
 from dataclasses import dataclass, replace
@@ -41,21 +42,22 @@ TOLERANCE = 1e-3
 WINDOW, REST = 6.0, 1.0
 #: The run after the motion is at least this long: a loop may be slow on a fast arm [s].
 MIN_WINDOW = 2.0
-#: To see what noise alone makes the arm is only held, for so many times that window: nothing else is left by then [-].
+#: For the effect of noise alone the arm is only held, for this many times that window: by then nothing else is left
+#: [-].
 HOLD = 2.0
-#: Its motion leads nowhere and is short: a long one takes long to plan [s].
+#: Its motion has no distance and is short: a long motion takes long to plan [s].
 SHORT = 0.1, 0.2
 #: Joints are at rest within this of the reference [deg].
 JOINT_REST = 0.02
-#: Samples per second, where neither the controller's parameter ``rate`` nor the variant states another [Hz].
+#: Samples per second, if neither the controller's parameter ``rate`` nor the variant states another number [Hz].
 RATE = 1000.0
-#: The arm counts as lost at this joint error [rad]. Shaped baselines are late by their shaper: it is generous.
+#: The arm counts as lost at this joint error [rad]. It is generous, because shaped baselines are late by their shaper.
 MAX_ERROR = 2.0
-#: Substeps per sample up to which the explicit method is taken, and longest step of the implicit one [s].
+#: Substeps per sample up to which the explicit method is used, and longest step of the implicit one [s].
 EXPLICIT, STEP = 4, 2.5e-5
-#: Rate at which friction damps a joint that turns around, times a step of dop853, at most [-].
+#: Largest product of the rate at which friction damps a joint that reverses and a step of dop853 [-].
 DAMPED = 1.0
-#: A run of the implicit method that is lost is repeated in steps so many times as short.
+#: A lost run of the implicit method is repeated in steps this many times as short.
 SHORTER = 3
 #: Largest angle by which friction moves a hub in one step [rad].
 KICK = np.radians(0.01)
@@ -63,7 +65,7 @@ KICK = np.radians(0.01)
 
 @dataclass(frozen=True)
 class ArmTask:
-    """An arm and its motion, as far as a run needs them; a `RandomArm` has the same.
+    """An arm and its motion, as a run needs them; a `RandomArm` has the same attributes.
 
     Attributes
     ----------
@@ -84,7 +86,7 @@ class ArmTask:
 
     @cached_property
     def period(self):
-        """Of the lowest mode with joints locked, the longer one of both ends of the motion [s]; 0.0: it is rigid."""
+        """Period of the lowest mode, joints locked, the longer of both ends of the motion [s]; 0.0: a rigid arm."""
         known = model.build(self.arm)
         if not known.n_modes:
             return 0.0
@@ -94,7 +96,7 @@ class ArmTask:
 
 
 def window_of(case):
-    """How long the arm is watched after its motion [s]."""
+    """Time for which the arm is watched after its motion [s]."""
     return max(WINDOW * case.period, MIN_WINDOW)
 
 
@@ -112,7 +114,7 @@ def run(case, setup, variant, seed=0):
     Returns
     -------
     dict
-        Ready for JSON: those of `judged`, ``lost`` with the reason where the arm was lost, or ``refused`` alone.
+        Ready for JSON: the numbers of `judged`, ``lost`` with the reason if the arm was lost, or only ``refused``.
     """
     try:
         shorter = 1
@@ -133,7 +135,7 @@ def run(case, setup, variant, seed=0):
 
 
 def _followed(case, setup, variant, seed, shorter):
-    """The loop after its run with steps `shorter` times as short, the record, the motion that was wanted, its end."""
+    """The loop after its run with steps `shorter` times as short, the record, the wanted motion, and its end."""
     loop = _prepared(case, setup, variant, seed)
     loop.simulator.plant.substeps *= shorter
     wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
@@ -146,8 +148,8 @@ def _followed(case, setup, variant, seed, shorter):
 def of_noise_alone(case, setup, variant, q, seed=0, shorter=1):
     """Rms of the tip about its mean, as a fraction of the reach [-], of an arm that is only held at `q` [rad].
 
-    Over the last `REST` period, as ``residual_tip`` of a run of the same case, setup and variant; None where the arm
-    can't be held. The steps are `shorter` times as short as usual.
+    It is taken over the last `REST` period, like ``residual_tip`` of a run of the same case, setup and variant; None if
+    the arm can't be held. The steps are `shorter` times as short as usual.
     """
     try:
         loop = _prepared(case, setup, variant, seed)
@@ -168,7 +170,7 @@ def of_noise_alone(case, setup, variant, q, seed=0, shorter=1):
 
 
 def _prepared(case, setup, variant, seed):
-    """The loop with the setup's own law, where it has one."""
+    """The loop with the setup's own law, if it has one."""
     loop = loop_of(case, setup, variant, seed)
     if setup.law is not None:
         loop.controller.law = setup.law(loop.model)
@@ -213,7 +215,7 @@ def _explicit_substeps(plant, period):
 
 
 def _mobility(plant, q):
-    """Diagonal of the inverse mass matrix, of the joints (n,) [1/(kg m^2)]."""
+    """Diagonal of the inverse mass matrix for the joints, (n,) [1/(kg m^2)]."""
     n = plant.n_joints
     return np.diag(np.linalg.inv(plant.terms(q, np.zeros(n)).M))[:n]
 
@@ -226,14 +228,14 @@ def longest_step(model, q):
     model : ArmModel
         Of the plant.
     q : ndarray, shape (n,)
-        Where it begins [rad].
+        Joint angles at the beginning [rad].
     """
     kick = np.max(model.friction_table()[:, 1] * _mobility(model, q), initial=0.0)
     return min(STEP, np.sqrt(KICK / kick)) if kick > 0.0 else STEP
 
 
 def _as_wanted(record, wanted, loop):
-    """The record with the motion that was wanted as its reference, not a shaped one."""
+    """The record with the wanted motion as its reference, not a shaped one."""
     return replace(record, reference=positions(wanted, record.time))
 
 
@@ -252,17 +254,17 @@ def judged(case, plant, record, end):
     -------
     dict
         ``peak_joint_error_deg``
-            The largest of all joints, from the motion's start on, about the motion that was wanted.
+            The largest of all joints, from the motion's start on, relative to the wanted motion.
         ``settling_s``, ``settling_periods``
             From the motion's end until the tip stays within the tolerance; None: not within the window.
         ``rest_joint_deg``
             Largest joint error over the last `REST` period; None for a record that does not reach it.
         ``rest_tip``
-            Largest distance of the tip from where it should be in that time, as a fraction of the reach [-].
+            Largest distance of the tip from its place of rest in that time, as a fraction of the reach [-].
         ``residual_tip``
             Rms of the tip about its own mean over that time, as a fraction of the reach [-].
         ``settled``, ``at_rest``
-            Whether the tip settled, and the joints came within `JOINT_REST`.
+            Whether the tip settled, and whether the joints came within `JOINT_REST`.
     """
     moving = record.time >= -1e-9
     error = np.degrees(joint_error(record.reference, record.plant_position)[moving])

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vibration of arms that take positions, measured on plants behind a position loop: ``flexarm vibration``."""
+"""``flexarm vibration``: measures the vibration of arms that take positions, on plants behind a position loop."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is tried: random arms, an arm on an elastic base, one link with payloads, each with three motions.
+"""Makes the cases: random arms, an arm on an elastic base, one link with payloads, each with three motions.
 
-Durations are drawn from the seed, in periods of the lowest mode with joints locked: a trapezoid leaves nothing of a
-mode where its ramps are whole periods, by chance. The drives bear the weight with the payload that they know.
+Durations are drawn from the seed, in periods of the lowest mode with joints locked: by chance, a trapezoid leaves
+nothing of a mode if its ramps are whole periods. The drives compensate the weight with the payload that they know.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,8 @@ from flexarm_dynamics.models import model
 from ..random_arms import generator
 from .time_laws import trapezoid
 
-#: Durations of the three motions, in locked periods; from and to which part of the arm's own way each goes.
+#: Ranges of the durations of the three motions, in locked periods; start and end of each as fractions of the arm's own
+#: way.
 DURATIONS = ((2.0, 2.4), (2.4, 3.0), (3.0, 4.0))
 WAYS = ((0.0, 0.7), (0.0, 1.0), (1.0, 0.0))
 #: Payloads of the arm with one link, as multiples of its own.
@@ -33,9 +34,9 @@ class Case:
     ----------
     name : str
     known, plant : Arm
-        As the drives know it; as it is.
+        The arm as the drives know it, and as it is.
     period : float
-        Of the lowest mode with joints locked [s].
+        Period of the lowest mode with joints locked [s].
     motions : list of PiecewiseMotion
     """
 
@@ -114,7 +115,7 @@ observed_modes: [strip_y_mode1]
 
 
 def payload(factor, seed=0) -> Case:
-    """One link with `factor` times its payload, of which the drives know one; durations by `seed`."""
+    """One link with `factor` times the payload that the drives know; durations by `seed`."""
     arm = arm_file.parse(ONE_LINK, "one_link")
     ends = np.array([-0.6]), np.array([0.6])
     return _case(f"one link, payload x{factor:g}", arm, scaled(arm, payload=factor), *ends, seed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm vibration``: how much arms behind a position loop swing after motions, shaped and not."""
+"""``flexarm vibration``: measures how much arms behind a position loop swing after motions, shaped and not."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,7 +121,7 @@ def _show(lines, path, where):
 
 
 def _more_time(rows, count, seed):
-    """The table of what `retimed` leaves in `report.TIMES` of what it misses, and the markers around it."""
+    """The table of what `retimed` leaves in `report.TIMES` for the motions that it misses, and its markers."""
     known, missed = _missed(rows, count, seed, ("retimed",))
     found = [
         (row, study.in_more_time(known[row["arm"]], row["motion"], report.TIMES)) for row in missed
@@ -130,7 +130,7 @@ def _more_time(rows, count, seed):
 
 
 def _more_places(rows, count, seed):
-    """The table of what `retimed` leaves by modes at `report.PLACES` of what it misses, and the markers around it."""
+    """The table of what `retimed` leaves with modes at `report.PLACES` for motions that it misses, and its markers."""
     known, missed = _missed(rows, count, seed, report.LISTED)
     found = [
         (row, study.at_more_places(known[row["arm"]], row["motion"], report.PLACES, off))
@@ -140,14 +140,14 @@ def _more_places(rows, count, seed):
 
 
 def _limits(rows, count, seed):
-    """The table of the least that a time law leaves of what `retimed` misses, and the markers around it."""
+    """The table of the least that a time law leaves for the motions that `retimed` misses, and its markers."""
     known, missed = _missed(rows, count, seed, ("retimed",))
     found = [(row, study.at_least(known[row["arm"]], row["motion"])) for row in missed]
     return report.limit_table(found), report.LIMIT
 
 
 def _in_trials(rows, count, seed):
-    """The table of what `retimed` leaves after corrections of what it misses, and the markers around it."""
+    """The table of what `retimed` leaves after corrections for the motions that it misses, and its markers."""
     known, missed = _missed(rows, count, seed, report.LISTED)
     found = [
         (row, study.in_trials(known[row["arm"]], row["motion"], report.CORRECTIONS, off))
@@ -157,7 +157,7 @@ def _in_trials(rows, count, seed):
 
 
 def _missed(rows, count, seed, methods):
-    """Cases by name, and the rows of some methods that are not within what is wanted."""
+    """Cases by name, and the rows of some methods that exceed the wanted residual."""
     known = {case.name: case for case in (make() for make in cases.all_of(count, seed).values())}
     return known, [row for row, _ in report.missed(rows, methods)]
 
@@ -168,7 +168,7 @@ def run(seed, count, path=None, processes=None, scheduler=None, methods=study.ME
     Parameters
     ----------
     seed, count : int
-        Of the random arms.
+        Seed and number of the random arms.
     path : str, optional
         File of the results, see `Store`.
     processes, scheduler

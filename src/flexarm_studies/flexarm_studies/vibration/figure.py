@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A figure of one arm's tip after a planner's motion and after the same motion shaped."""
+"""Draws one arm's tip after a planner's motion and after the same motion shaped."""
 
 import numpy as np
 
@@ -10,13 +10,13 @@ from ..plotting import DESIGNED, SLOW, plt
 from . import cases, study
 from .position_arm import PositionArm
 
-#: What is drawn, and for how many periods after the motion.
+#: Methods that are drawn, with their colours, and number of periods shown after the motion.
 SHOWN = {"trapezoid": SLOW, "robust": DESIGNED}
 AFTER = 8.0
 
 
 def draw(path, seed=0):
-    """Draw one link with its payload, its second motion; the file `path`. Durations by `seed`."""
+    """Draw the second motion of one link with its payload into the file `path`. Durations by `seed`."""
     case = cases.payload(1.0, seed)
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
     motion = case.motions[1]
@@ -36,14 +36,14 @@ def draw(path, seed=0):
 
 
 def way(swing, period):
-    """How far the tip still is from where it comes to rest, along the direction in which it swings, (k,) [m].
+    """Distance of the tip from its place of rest, along the direction in which it swings, (k,) [m].
 
     Parameters
     ----------
     swing : Swing
         Of several periods after the motion.
     period : float
-        That it swings with, about whose mean it does [s].
+        Period of the swing; the mean over it is the place of rest [s].
     """
     rest = swing.tip[swing.time > swing.time[-1] - period].mean(axis=0)
     away = swing.tip - rest

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The least that any time law can leave of a motion, found on the simulated arm itself.
+r"""Finds the least vibration that any time law can leave after a motion, on the simulated arm itself.
 
-A time law of `flexarm_control.shaping.time_law` has the accelerations x at its inner nodes. Here its modes are not
-asked: what the tip y does in a window after the end is linearised by differences, :math:`\partial y/\partial x`, each
-column a simulated motion, and
+A time law of `flexarm_control.shaping.time_law` has the accelerations x at its inner nodes. Its modes are not used
+here. The motion of the tip y in a window after the end is linearised by differences, :math:`\partial y/\partial x`;
+each column is a simulated motion. Then
 
 .. math:: \min_{\delta, c, e} \lVert e\rVert \quad\text{with}\quad
     \lvert y_i(t) + (\partial y_i/\partial x)\,\delta - c_i\rvert \le e_i, \quad |\delta_k| \le r, \quad
     |\ddot\sigma| \le a,\; 0 \le \dot\sigma \le v,\; \dot\sigma(T) = 0,\; \sigma(T) = 1
 
-is a linear programme over time t and axes i, with the norm as the largest of its `directions`. The steps
-:math:`\delta` are taken while the simulated residual falls, with half the radius r where it does not. This is
-successive linear programming with a trust region (Palacios-Gomez, Lasdon & Engquist 1982). What it finds can be done; a
-smaller residual elsewhere, far from where it began, is not excluded.
+is a linear programme over time t and axes i, with the norm as the largest over its `directions`. The steps
+:math:`\delta` are taken while the simulated residual falls; otherwise the radius r is halved. This is successive linear
+programming with a trust region (Palacios-Gomez, Lasdon & Engquist 1982). Its result is feasible; a smaller residual
+elsewhere, far from the start, is not excluded.
 """
 
 import numpy as np
@@ -23,13 +23,13 @@ from flexarm_control.shaping.time_law import ITERATIONS, SLACK
 
 #: Step of the differences, and the first radius, over the largest acceleration [-].
 DIFFERENCE, RADIUS = 0.05, 0.3
-#: Linearisations, and steps that are tried after each.
+#: Number of linearisations, and of steps that are tried after each.
 ROUNDS, TRIES = 4, 4
-#: A linearisation that gains less than this fraction is the last one [-].
+#: A linearisation that improves the residual by less than this fraction is the last one [-].
 GAIN = 0.05
-#: Times in the window at which the tip is looked at.
+#: Number of times in the window at which the tip is evaluated.
 TIMES = 120
-#: Angles between the directions of the norm, in which it is right to 1.5 %.
+#: Number of angles between the directions of the norm, which is then accurate to 1.5 %.
 ANGLES = 9
 
 
@@ -43,7 +43,7 @@ def least(arm, law, x, window):
     x : (N - 1,) ndarray
         Accelerations to begin with [1/s^2].
     window : float
-        In which the residual is looked for [s].
+        Length of the window of the residual [s].
 
     Returns
     -------
@@ -71,7 +71,7 @@ def least(arm, law, x, window):
 
 
 def _made(arm, law, x, window):
-    """Residual [m], and where the tip is at `TIMES` after the end (TIMES, 3) [m]."""
+    """Residual [m], and positions of the tip at `TIMES` after the end (TIMES, 3) [m]."""
     swing = arm.follow(law.motion(x), window)
     times = swing.end + np.linspace(0.0, window, TIMES)
     tip = np.array([np.interp(times, swing.time, axis) for axis in swing.tip.T]).T
@@ -79,17 +79,17 @@ def _made(arm, law, x, window):
 
 
 def _slope(arm, law, x, free, window, tip):
-    """What each free direction (N - 1, f) of the accelerations does to the tip, (TIMES, 3, f)."""
+    """Effect of each free direction (N - 1, f) of the accelerations on the tip, (TIMES, 3, f)."""
     step = DIFFERENCE * law.limits[1]
     columns = [(_made(arm, law, x + step * way, window)[1] - tip) / step for way in free.T]
     return np.stack(columns, axis=2)
 
 
 def _change(law, x, free, slope, tip, radius):
-    """The change of x within a radius that leaves least by the linearisation."""
+    """The change of x within a radius that leaves least according to the linearisation."""
     velocity, acceleration = law.limits
     size, now = max(np.ptp(tip, axis=0).max(), 1e-12), law.inner @ x
-    # The unknowns: steps along `free`, the middle and half the width of what each axis swings, the norm.
+    # The unknowns: steps along `free`, the middle and half the width of each axis's swing, the norm.
     steps, middle, half, norm = np.split(np.eye(free.shape[1] + 7), [-7, -4, -1])
     rows, limits = [directions() @ half - norm], [np.zeros(ANGLES**2)]
     for axis in range(3):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A simulated arm behind a position loop, commanded as by a joint_trajectory_controller, and how its tip swings."""
+"""Simulates an arm behind a position loop, commanded as by a joint_trajectory_controller, and how its tip swings."""
 
 from dataclasses import dataclass
 
@@ -12,20 +12,20 @@ from flexarm_sim.position_loop import PARAMETERS, PositionLoop
 
 #: Samples of the drives per second, and of the commands; delay of these [Hz], [Hz], [s].
 DRIVE_RATE, COMMAND_RATE, DELAY = 1000.0, 125.0, 0.008
-#: Bandwidth of the drives: of so many times the lowest mode with joints locked, within these limits [rad/s].
+#: Bandwidth of the drives: this many times the lowest mode with joints locked [-], within these limits [rad/s].
 TIMES, BANDWIDTH = 4.0, (20.0, 125.0)
-#: A loop that is unstable gets so much slower, at most so often.
+#: Factor by which an unstable loop is made slower, and max. number of times.
 SLOWER, ATTEMPTS = 0.7, 20
-#: A plant whose drives make it stiffer than this for an explicit method, in substeps per sample of the drives, is
-#: integrated implicitly: a light joint behind a flexible link takes thousands.
+#: A plant whose drives make an explicit method need more substeps per sample of the drives than this is integrated
+#: implicitly: a light joint behind a flexible link takes thousands.
 MAX_SUBSTEPS = 1000
-#: The tip is looked at in every second sample.
+#: The tip is evaluated at every second sample.
 TIP_EVERY = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """What a motion did.
+    """Result of a motion.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Swing:
     tip : (k, 3) ndarray
         [m]
     end : float
-        When the last command acts [s].
+        Time at which the last command acts [s].
     saturated : bool
         Whether a drive was at its torque limit.
     """
@@ -45,25 +45,25 @@ class Swing:
     saturated: bool
 
     def residual(self, window):
-        """Amplitude of the tip after the end, over a `window` [s]: half of what it moves, of all axes together [m]."""
+        """Amplitude of the tip after the end, over a `window` [s]: half of its range, of all axes together [m]."""
         after = self.tip[(self.time >= self.end) & (self.time <= self.end + window)]
         return float(np.linalg.norm(0.5 * np.ptp(after, axis=0)))
 
     def ringing(self, settle=0.0):
-        """The tip after the end and a time to `settle` [s], about its mean (k, 3) [m]."""
+        """The tip from a time `settle` [s] after the end on, about its mean (k, 3) [m]."""
         after = self.tip[self.time >= self.end + settle]
         return after - after.mean(axis=0)
 
 
 class PositionArm:
-    """An arm whose drives hold what they are commanded.
+    """An arm whose drives hold the commanded positions.
 
     Parameters
     ----------
     known : ArmModel
-        As the drives know it.
+        The arm as the drives know it.
     plant : ArmModel
-        As it is.
+        The arm as it is.
     lowest : float
         Lowest natural frequency with joints locked [rad/s].
     """
@@ -100,7 +100,7 @@ class PositionArm:
         motion : object
             With `position` of times (k,) [s], (k, n) [rad], and `duration` [s].
         after : float
-            Time to look at the tip afterwards [s].
+            Time for which the tip is evaluated afterwards [s].
         """
         plant, loop, model = self.plant, self.loop, self.plant.model
         every = round(DRIVE_RATE / COMMAND_RATE)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One link behind a position loop, pushed aside and released: how fast it comes to rest, damped by a sensor and not.
+"""Pushes one link behind a position loop aside and releases it: how fast it comes to rest, damped by a sensor and not.
 
-What the damping knows is measured on the same simulated arm, behind the same drives, with the payload that it has:
-frequency and damping from the ringing after a small motion, the answer to corrections from a burst of the command.
+The data of the damping are measured on the same simulated arm, behind the same drives, with its actual payload:
+frequency and damping from the ringing after a small motion, and the response to corrections from a burst of the
+command.
 """
 
 from dataclasses import dataclass
@@ -23,15 +24,15 @@ BEGIN, END = "<!-- pushes: begin -->", "<!-- pushes: end -->"
 PERIOD = 1.0 / COMMAND_RATE
 #: Payloads, as multiples of the one that the drives know.
 PAYLOADS = (0.0, 1.0, 2.0, 3.0)
-#: The push bends the link so far [m]; noise of the strain [-].
+#: Bending of the link by the push [m]; noise of the strain [-].
 PUSH, NOISE = 0.01, 1e-6
-#: More noise that is tried [-].
+#: Larger noise that is tried [-].
 NOISY = 1e-5
 #: Noise of the accelerometer at the tip, at the rate of the commands, and its full scale [m/s^2].
 IMU_NOISE, IMU_SCALE = 0.05, 40.0
-#: Which way the small motion goes whose ringing is measured [rad].
+#: Distance of the small motion whose ringing is measured [rad].
 WAY = np.array([1.2])
-#: Amplitude of the burst [rad], and periods of ringing recorded with it.
+#: Amplitude of the burst [rad], and number of periods of ringing recorded with it.
 BURST, LISTEN = 0.01, 6.0
 #: Periods for which the release is watched, and fraction of the first swing at which it has decayed [-].
 WATCHED, DECAYED = 36.0, 0.1
@@ -67,7 +68,7 @@ class Decay:
     frequency, ratio : float
         Measured, of the lowest mode [Hz], [-].
     phase : float
-        Of its answer to corrections [rad].
+        Phase of its response to corrections [rad].
     without, damped : float
         Time until the tip swings less than `DECAYED` of its first swing [s].
     low, high : float
@@ -115,14 +116,14 @@ class Decay:
 
 
 class Bench:
-    """An arm, and the first of its gauges or an accelerometer at its tip.
+    """An arm with a sensor: the first of its gauges, or an accelerometer at its tip.
 
     Parameters
     ----------
     arm : PositionArm
         With one joint.
     imu : bool
-        Whether the sensor is the accelerometer, across the link as it is not bent.
+        Whether the sensor is the accelerometer; it measures across the undeformed link.
     """
 
     def __init__(self, arm, imu=False):
@@ -136,18 +137,18 @@ class Bench:
         Parameters
         ----------
         references : (k,) ndarray
-            Of its joint [rad].
+            References of its joint [rad].
         correct : callable
-            ``correct(now, strain)`` gives what is added [rad].
+            ``correct(now, strain)`` gives the correction that is added [rad].
         pushed : float
             First modal amplitude at the start [m].
         noise : float
-            Of the sensor; not given: the usual one.
+            Noise of the sensor; not given: the usual one.
 
         Returns
         -------
         tip : (k, 3) ndarray
-            When each command is sent [m].
+            Tip when each command is sent [m].
         strains, corrections : (k,) ndarrays
             [-], [rad]
         """
@@ -176,7 +177,7 @@ class Bench:
         return np.array(plant.model.tip_position(plant.q, plant.delta))
 
     def _reading(self, path):
-        """Of the sensor, with the last three places of the tip, a sample of the drives apart."""
+        """Reading of the sensor, from the last three positions of the tip, one sample of the drives apart."""
         plant = self._arm.plant
         if not self._imu:
             return float(self._row @ plant.delta)
@@ -184,7 +185,7 @@ class Bench:
         return float(across @ (path[2] - 2.0 * path[1] + path[0])) * DRIVE_RATE**2
 
     def settings(self, found):
-        """Settings of the damping: of the mode `found`, and its answer to a burst."""
+        """Settings of the damping, from the mode `found` and its response to a burst."""
         frequency, ratio = float(found.frequencies[0]), float(found.dampings[0])
         sent = strain_damping.burst(frequency, BURST, PERIOD)
         sent = np.append(sent, np.zeros(int(LISTEN / (frequency * PERIOD))))
@@ -198,7 +199,7 @@ class Bench:
 
 
 def prepared(payload, seed=0, imu=False):
-    """The case of a payload, its bench, and the settings of the damping that are measured on it."""
+    """The case of a payload, its bench, and the settings of the damping measured on it."""
     case = cases.payload(payload, seed)
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
     bench = Bench(arm, imu)
@@ -228,7 +229,7 @@ def decay(payload, seed=0) -> Decay:
 
 
 def _swing(case, bench, correct):
-    """What the tip moves from one to four locked periods after the end of the case's first motion [m]."""
+    """Motion of the tip from one to four locked periods after the end of the case's first motion [m]."""
     motion = case.motions[0]
     first, last = (motion.duration + n * case.period for n in (1.0, 4.0))
     references = motion.position(np.arange(int(last / PERIOD)) * PERIOD)[:, 0]
@@ -241,7 +242,7 @@ def _no_correction(*_):
 
 
 def _law(settings, factor=1.0):
-    """The damping, at rest before the push; its frequency times a factor."""
+    """The damping, at rest before the push, with its frequency times a factor."""
     changed = {**settings, "frequency": settings["frequency"] * factor}
     damping = strain_damping.StrainDamping(changed, PERIOD)
     damping.update(-PERIOD, 0.0)
@@ -249,7 +250,7 @@ def _law(settings, factor=1.0):
 
 
 def _time(tip):
-    """When the tip (k, 3) has come within `DECAYED` of its first swing for good [s]."""
+    """Time from which the tip (k, 3) stays within `DECAYED` of its first swing [s]."""
     away = np.linalg.norm(tip - tip[-1], axis=1)
     over = np.flatnonzero(away > DECAYED * away[0])
     return float(over[-1] + 1) * PERIOD

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of residual vibration, for the terminal and for docs/vibration.md."""
+"""Writes the table of residual vibration for the terminal and for docs/vibration.md."""
 
 import numpy as np
 
@@ -8,17 +8,17 @@ from .study import METHODS
 
 BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
 TIME = "<!-- more time: begin -->", "<!-- more time: end -->"
-#: Periods that a motion may get longer by, one as in the tables and more [-].
+#: Periods by which a motion may get longer: one, as in the tables, and more [-].
 TIMES = (1.0, 1.5, 2.0, 3.0)
 BENT = "<!-- bent: begin -->", "<!-- bent: end -->"
-#: Places along a motion at which its modes are measured.
+#: Numbers of places along a motion at which its modes are measured.
 PLACES = (3, 5, 9)
 PLACED = "<!-- more places: begin -->", "<!-- more places: end -->"
 LIMIT = "<!-- limit: begin -->", "<!-- limit: end -->"
 TRIALS = "<!-- trials: begin -->", "<!-- trials: end -->"
-#: Corrections of a motion that is made again and again.
+#: Number of corrections of a motion that is repeated.
 CORRECTIONS = 5
-#: What is wanted of a method: residual over that of the trapezoid [-].
+#: Wanted residual of a method, over that of the trapezoid [-].
 WANTED = {
     "robust": 0.1,
     "zvd": 0.1,
@@ -32,7 +32,7 @@ WANTED = {
     "retimed +15 %": 0.2,
 }
 UNSHAPED = METHODS[0]
-#: Methods of which each motion that is not within what is wanted is listed; of the others it is counted.
+#: Methods of which each motion that exceeds the wanted residual is listed; for the others, such motions are counted.
 LISTED = ("retimed", "retimed -15 %", "retimed +15 %")
 COLUMNS = (
     "method",
@@ -75,7 +75,7 @@ def summary(rows):
 
 
 def groups(rows):
-    """Rows by what kind of arm they are of, a dict."""
+    """Rows by kind of arm, a dict."""
     named = {"random arms": [], "elastic base": [], "one link, payload 0 to 3 times": []}
     for row in rows:
         kind = "elastic base" if row["arm"] == "elastic base" else "random arms"
@@ -85,13 +85,13 @@ def groups(rows):
 
 
 def missed(rows, methods=LISTED):
-    """(row, ratio) of each motion that is not within what is wanted, of some methods."""
+    """(row, ratio) of each motion that exceeds the wanted residual, of some methods."""
     found = ratios(rows)
     return [pair for m in methods for pair in found[m] if pair[1] > WANTED[m]]
 
 
 def missed_lines(rows):
-    """Lines about each motion that is not within what is wanted, of the methods `LISTED`."""
+    """Lines about each motion that exceeds the wanted residual, of the methods `LISTED`."""
     lines = []
     for row, ratio in missed(rows):
         modes = ", ".join(f"{f:.2f}" for f in row["frequencies"])
@@ -101,14 +101,14 @@ def missed_lines(rows):
 
 
 def time_table(found):
-    """Lines of the table of what `retimed` leaves in more time: of pairs of a row and its ratios for `TIMES`."""
+    """Lines of the table of what `retimed` leaves in more time, from pairs of a row and its ratios for `TIMES`."""
     columns = ("motion", *(f"{times:g} period{'s' * (times != 1.0)}" for times in TIMES))
     named = ((f"{row['arm']}, motion {row['motion']}", *left) for row, left in found)
     return table(columns, named)
 
 
 def places_table(found):
-    """Lines of the table of what `retimed` leaves by modes at more places: of rows and their ratios for `PLACES`."""
+    """Lines of the table of what `retimed` leaves with modes at more places, from rows and ratios for `PLACES`."""
     columns = ("motion", "method", "wanted", *(f"{count} places" for count in PLACES))
     named = (
         (f"{row['arm']}, motion {row['motion']}", row["method"], WANTED[row["method"]], *left)
@@ -118,7 +118,7 @@ def places_table(found):
 
 
 def limit_table(found):
-    """Lines of the table of the least that a time law leaves: of pairs of a row and `study.at_least` of its motion."""
+    """Lines of the table of the least that a time law leaves, from a row and `study.at_least` of its motion each."""
     columns = ("motion", "unshaped, mm", "retimed, mm", "retimed", "least, mm", "least")
     named = (
         (
@@ -135,7 +135,7 @@ def limit_table(found):
 
 
 def trials_table(found):
-    """Lines of the table of what `retimed` leaves after corrections: of pairs of a row and its residuals."""
+    """Lines of the table of what `retimed` leaves after corrections, from pairs of a row and its residuals."""
     columns = ("motion", "method", "wanted", *(f"{n} corrections" for n in range(CORRECTIONS + 1)))
     named = (
         (f"{row['arm']}, motion {row['motion']}", row["method"], WANTED[row["method"]], *least)

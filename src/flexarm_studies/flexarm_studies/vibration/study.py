@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Residual vibration of arms behind a position loop: shaped motions beside what planners make.
+"""Measures residual vibration of arms behind a position loop, for shaped motions and for those of planners.
 
-What the shapers know is what a user can measure: frequencies and damping of the ringing after a small, short motion of
-the same simulated arm, behind the same drives. The arms' files are not looked at.
+The shapers know only what a user can measure: frequencies and damping of the ringing after a small, short motion of the
+same simulated arm, behind the same drives. The arm files are not used.
 """
 
 from dataclasses import dataclass
@@ -26,27 +26,27 @@ from . import limit
 from .position_arm import PositionArm
 from .time_laws import jerk_limited, resampled, trapezoid
 
-#: The kick after which ringing is measured: so much of the way, in so many locked periods; for how many it is recorded.
+#: The kick after which ringing is measured: fraction of the way, duration and recorded time in locked periods.
 KICK, KICK_PERIODS, LISTEN = 0.05, 0.8, 14.0
-#: Window in which the residual is looked for, in locked periods.
+#: Window of the residual, in locked periods.
 WINDOW = 1.5
-#: Modes that are shaped have at least this fraction of the largest amplitude, and at most this damping; how many.
+#: Min. fraction of the largest amplitude, max. damping, and max. number of the shaped modes.
 AUDIBLE, MAX_DAMPING, MAX_MODES = 0.03, 0.3, 3
-#: Modes closer than this fraction are one.
+#: Modes closer than this fraction count as one.
 SAME = 0.12
 #: Modes of the two ends of a motion that are closer than this fraction are given once.
 ALIKE = 0.02
-#: A mode changes at most by this factor from one configuration on the way to the next.
+#: Largest factor by which a mode changes from one configuration on the way to the next.
 CHANGE = 2.0
-#: The tip is recorded for so much longer than it is looked at [s].
+#: The tip is recorded for this much longer than it is evaluated [s].
 LATE = 0.02
-#: MoveIt's resampling, a usual time for the acceleration to rise [s], and by how much frequencies are off [-].
+#: MoveIt's resampling, a usual rise time of the acceleration [s], and the tried error of frequencies [-].
 RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
 #: Methods by TOPP-RA and by Ruckig.
 QUICKEST = ("toppra", "ruckig, one period")
 #: Factors of the frequencies for the methods by a new time law [-].
 OFFS = {"retimed": 1.0, "retimed -15 %": 1.0 - OFF, "retimed +15 %": 1.0 + OFF}
-#: A path bends aside by this fraction of its largest way [-]; methods that it is shaped by, after the motion as it is.
+#: A path bends aside by this fraction of its largest way [-]; the unshaped motion and the methods that shape it.
 ASIDE = 0.25
 BENT = ("trapezoid", "robust, both ends", "robust, both ends -15 %", "robust, both ends +15 %")
 METHODS = (
@@ -71,7 +71,7 @@ METHODS = (
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Modes found in ringing: frequencies [Hz], damping ratios [-], the one that rings most first."""
+    """Modes found in ringing: frequencies [Hz], damping ratios [-]; the mode that rings most comes first."""
 
     frequencies: np.ndarray
     dampings: np.ndarray
@@ -96,9 +96,9 @@ def measured(arm, at, way, period) -> Measured:
     ----------
     arm : PositionArm
     at, way : (n,) ndarrays
-        Where the kick ends, and which way it goes [rad].
+        End of the kick, and its direction [rad].
     period : float
-        About that of the lowest mode [s].
+        Approximate period of the lowest mode [s].
     """
     kick = trapezoid(at - KICK * way, at, KICK_PERIODS * period)
     swing = arm.follow(kick, LISTEN * period)
@@ -124,7 +124,7 @@ def shaped(motion, kind, found, off=1.0):
         Shaper.
     found : Measured
     off : float
-        Factor of the frequencies: how wrong they are taken to be [-].
+        Factor of the frequencies, that is, their assumed error [-].
     """
     frequencies, dampings = found.frequencies * off, found.dampings
     if kind != modes_module.ROBUST:
@@ -135,7 +135,7 @@ def shaped(motion, kind, found, off=1.0):
 
 
 def together(found, other) -> Measured:
-    """All modes of both ends of a motion; those of `other` that `found` has, too, are left out.
+    """All modes of both ends of a motion; those of `other` that are also in `found` are left out.
 
     Parameters
     ----------
@@ -153,20 +153,20 @@ def together(found, other) -> Measured:
 
 
 def rows(found, others, count=None):
-    """Modes at several places of a motion as rows, as many as ring at any of them, each mode in its own column.
+    """Modes at several places of a motion as rows, with each mode in its own column, as many as ring at any place.
 
-    Modes keep their order of frequency along the way. Where fewer are found, two of them are close to each other, or
-    one is silent there, and one counts for both; one that would change by more than `CHANGE` from row to row stays as
-    it is.
+    Modes keep their order of frequency along the way. If fewer are found at a place, two of them are close to each
+    other, or one is silent there; then one counts for both. A mode that would change by more than `CHANGE` from row to
+    row stays as it is.
 
     Parameters
     ----------
     found : Measured
         At the end of the motion.
     others : sequence of Measured
-        At places before, from the end to the start.
+        Modes at earlier places, from the end to the start.
     count : int, optional
-        As many modes as this, the loudest.
+        Number of modes, the loudest ones.
 
     Returns
     -------
@@ -176,7 +176,7 @@ def rows(found, others, count=None):
     places = [*reversed(others), found]
     counts = [place.frequencies.size for place in places]
     count = count or max(counts)
-    # Of places with as many the last: the ringing at the end counts.
+    # Of places with the same number, take the last: the ringing at the end counts.
     known = max(range(len(places)), key=lambda k: (min(counts[k], count), k))
     made = {known: _ascending(places[known], count)}
     for k in (*range(known - 1, -1, -1), *range(known + 1, len(places))):
@@ -185,7 +185,7 @@ def rows(found, others, count=None):
 
 
 def _continued(place, after, count):
-    """The modes of a place that go on from a row `after` (2, count), (2, count)."""
+    """The modes of a place that continue those of a row `after` (2, count), (2, count)."""
     if not place.frequencies.size:
         return after
     mode = _ascending(place, count)
@@ -210,11 +210,11 @@ def retimed(motion, along, off=1.0, periods=1.0):
     ----------
     motion : PiecewiseMotion
     along : tuple of (3, m) ndarrays
-        As of `rows`.
+        As from `rows`.
     off : float
-        Factor of the frequencies: how wrong they are taken to be [-].
+        Factor of the frequencies, that is, their assumed error [-].
     periods : float
-        How much longer the motion may get, in periods of the lowest mode.
+        Time by which the motion may get longer, in periods of the lowest mode.
     """
     modes = _modes(motion, along, off, periods)
     return time_law.retimed(motion, modes) or Shaped(ShapedMotion(motion, modes))
@@ -235,7 +235,7 @@ def _modes(motion, along, off, periods=1.0):
 
 
 def quickest(motion, rise):
-    """The motion's line by TOPP-RA and by Ruckig, within the speed and acceleration of the motion, a dict.
+    """The motion's line, timed by TOPP-RA and by Ruckig, within the speed and acceleration of the motion, a dict.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ def quickest(motion, rise):
     speed, bend = (
         np.abs(motion.derivative(k, motion.knots[1:] - 1e-9)).max(axis=0) for k in (1, 2)
     )
-    # A joint that stands may move a little.
+    # A joint that stands still may move a little.
     speed, bend = (np.maximum(values, 1e-6 * values.max()) for values in (speed, bend))
     begin = np.stack([motion.start, 0.0 * motion.start, 0.0 * motion.start])
     found = (
@@ -258,7 +258,7 @@ def quickest(motion, rise):
 
 
 def candidates(motion, found, middle, other, methods=METHODS):
-    """The motion by each of some `METHODS`, a dict.
+    """The motion made by each of some `METHODS`, a dict.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ def run(case, methods=METHODS):
 
 
 def run_bent(case):
-    """Residuals of motions along paths that bend, between the ends of a case's motions: the quickest by TOPP-RA.
+    """Residuals of the quickest motions by TOPP-RA along paths that bend, between the ends of a case's motions.
 
     Parameters
     ----------
@@ -328,14 +328,14 @@ def run_bent(case):
     Returns
     -------
     list of dict
-        As of `run`, of the methods `BENT`; none of an arm with one joint.
+        As from `run`, for the methods `BENT`; none for an arm with one joint.
     """
     arm, out = _arm(case), []
     for number, motion in enumerate(case.motions):
         if motion.start.size == 1:
             continue
         given = bent(motion)
-        # Where it comes from at its end, where it goes at its start, as long as the way.
+        # Directions of the path at its end and at its start, as long as the way.
         first, last = (given.position(t * given.duration) for t in np.array([[0.1], [0.9]]))
         size = np.linalg.norm(motion.angle)
         ways = [
@@ -355,7 +355,7 @@ def run_bent(case):
 def bent(motion):
     """The quickest motion by TOPP-RA from start to end around a bend, by `ASIDE` of the largest way.
 
-    All joints keep the largest speed and acceleration of any of them in the motion that is given.
+    All joints stay within the largest speed and acceleration of any of them in the given motion.
 
     Parameters
     ----------
@@ -381,7 +381,7 @@ def _arm(case):
 
 
 def _left(arm, case, number, found, made):
-    """Rows of `run` of one motion: by each method of `made`, the first as it is; one without a method where none is."""
+    """Rows of `run` for one motion: one for each method of `made`; a row without a method if there is none."""
     common = {
         "arm": case.name,
         "motion": number,
@@ -406,7 +406,7 @@ def _left(arm, case, number, found, made):
 
 
 def in_more_time(case, number, times):
-    """What `retimed` leaves of a motion of a case when it may get longer by more than a period.
+    """What `retimed` leaves of a motion of a case if it may get longer by more than a period.
 
     Parameters
     ----------
@@ -438,7 +438,7 @@ def at_more_places(case, number, counts, off=1.0):
     counts : sequence of int
         Places from start to end, with both.
     off : float
-        Factor of the frequencies: how wrong they are taken to be [-].
+        Factor of the frequencies, that is, their assumed error [-].
 
     Returns
     -------
@@ -463,7 +463,7 @@ def at_more_places(case, number, counts, off=1.0):
 
 
 def at_least(case, number):
-    """What `retimed` leaves of a motion of a case, and the least that a time law as long is found to leave.
+    """What `retimed` leaves of a motion of a case, and the least that was found for a time law of the same length.
 
     Parameters
     ----------
@@ -479,7 +479,7 @@ def at_least(case, number):
     Raises
     ------
     DesignError
-        Where there is no new time law for the motion.
+        If there is no new time law for the motion.
     """
     arm, motion, _, along, unshaped = _prepared(case, number)
     found = time_law.solved(motion, _modes(motion, along, 1.0))
@@ -493,7 +493,8 @@ def at_least(case, number):
 def _prepared(case, number, at_end=False):
     """The arm of a case, a motion by its number, the modes at its end and along it, and what it leaves [m].
 
-    `at_end`: along it only as many modes as ring at the end, which is what the ringing after a trial shows.
+    With `at_end`, along it there are only as many modes as ring at the end, because the ringing after a trial shows
+    only these.
     """
     arm, motion = _arm(case), case.motions[number]
     end = measured(arm, motion.end, motion.angle, case.period)
@@ -505,7 +506,7 @@ def _prepared(case, number, at_end=False):
 
 
 def in_trials(case, number, count, off=1.0):
-    """What `retimed` leaves of a motion of a case that is made again and again, corrected by its own ringing.
+    """What `retimed` leaves of a motion of a case that is repeated and corrected by its own ringing.
 
     Parameters
     ----------
@@ -513,9 +514,9 @@ def in_trials(case, number, count, off=1.0):
     number : int
         Of the motion.
     count : int
-        Trials with a correction.
+        Number of trials with a correction.
     off : float
-        Factor of the frequencies: how wrong they are taken to be [-].
+        Factor of the frequencies, that is, their assumed error [-].
 
     Returns
     -------

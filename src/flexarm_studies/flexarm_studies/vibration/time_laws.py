@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Motions as MoveIt and others make them: trapezoidal speed, and with a limit of jerk as well.
+r"""Makes motions like MoveIt and others: with trapezoidal speed, and also with a limit of jerk.
 
-On a straight way in the joints from rest to rest, the time-optimal motion within limits of speed and acceleration
-(TOTG, TOPP-RA) is that with a trapezoid of speed. With a limit of jerk (Ruckig) it is the same convolved with a box
-whose width is acceleration over jerk, as long as the limits are reached. Both are exact here.
+On a straight path in the joints from rest to rest, the time-optimal motion within limits of speed and acceleration
+(TOTG, TOPP-RA) has a trapezoid of speed. With a limit of jerk (Ruckig) it is the same convolved with a box whose width
+is acceleration over jerk, as long as the limits are reached. Both are exact here.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.interpolate import PPoly
 
 from flexarm_control.shaping.piecewise import PiecewiseMotion
 
-#: Part of a trapezoid's duration in which it accelerates, and again in which it brakes [-].
+#: Fraction of a trapezoid's duration in which it accelerates, and in which it brakes [-].
 RAMP = 1.0 / 3.0
 
 
@@ -59,7 +59,7 @@ def jerk_limited(motion, width):
     motion : PiecewiseMotion
         Of cubic polynomials at most.
     width : float
-        Acceleration over jerk: how much longer the motion gets [s].
+        Acceleration over jerk, by which the motion gets longer [s].
     """
     still = np.zeros((1, *motion.coefficients.shape[1:]))
     before, after = still.copy(), still.copy()

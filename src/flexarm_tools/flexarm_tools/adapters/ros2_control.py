@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adapter node: an arm behind ros2_control, or anything that speaks its topics, becomes a driver of flexarm.
+"""Adapter node: makes an arm behind ros2_control, or anything that uses the same topics, a driver of flexarm.
 
-`joint_states` and an array of strains in, `arm_state` out; `joint_torque` in, an array of efforts out, in the
-order of the effort controller. Without a fresh torque the efforts take the safe action: zero, or against the joint's
-velocity.
+It receives `joint_states` and an array of strains, and publishes `arm_state`. It receives `joint_torque`, and publishes
+an array of efforts in the order of the effort controller. Without a fresh torque the efforts are those of the safe
+action: zero, or against the joint's velocity.
 """
 
 import math
@@ -36,11 +36,11 @@ def _fixed(name, default, unit="-", low=None, high=None, **options):
 PARAMETERS = (
     ARM,
     _fixed("joint_state_topic", "joint_states").described(
-        "Where joint_state_broadcaster publishes."
+        "Topic that joint_state_broadcaster publishes."
     ),
     _fixed("strain_topic", "strain").described("Strains, std_msgs/Float64MultiArray [m/m]."),
     _fixed("effort_topic", "effort_controller/commands").described(
-        "Where effort_controllers/JointGroupEffortController listens."
+        "Topic that effort_controllers/JointGroupEffortController subscribes to."
     ),
     _fixed("joint_names", [""]).described(
         "Names in joint_state_topic of the arm file's joints, in the arm file's order; empty: the same names."
@@ -52,14 +52,14 @@ PARAMETERS = (
         "Gauges in the order of strain_topic, by the arm file's names; empty: the arm file's order."
     ),
     _fixed("use_effort", False).described(
-        "Whether the effort of joint_state_topic is the torque applied [N m]; false: the torque sent is reported."
+        "Whether the effort of joint_state_topic is the torque applied [N m]; false: the sent torque is reported."
     ),
     TORQUE_TIMEOUT,
     _fixed("strain_timeout", 0.02, "s", 0.001, 10.0).described(
         "Strains older than this are reported as NaN: missing."
     ),
     _fixed("safe_action", "damp", choices=("damp", "zero")).described(
-        "Efforts without a fresh torque: damp, against the joint velocity; zero."
+        "Efforts without a fresh torque. damp: against the joint velocity; zero: none."
     ),
     _fixed("safe_damping", [1.0], "N m s/rad", 0.0, 1e6, length="joints").described(
         "Effort per joint velocity of the safe action damp, with torque and soft start of the arm file's damp."
@@ -68,12 +68,12 @@ PARAMETERS = (
 
 
 def permutation(field, given, wanted):
-    """Indices in `given` of the `wanted` names; without names, their own order.
+    """Indices in `given` of the `wanted` names; without names, the order of `wanted`.
 
     Raises
     ------
     ParameterError
-        For the parameter `field`, where the names are not the same.
+        For the parameter `field`, if the names are not the same.
     """
     given = [n for n in given if n] or list(wanted)
     if sorted(given) != sorted(wanted):
@@ -119,7 +119,7 @@ class Readings:
         Raises
         ------
         MessageError
-            Where there are not as many as gauges.
+            If there are not as many as gauges.
         """
         if len(values) != self.strain.size:
             raise MessageError(
@@ -129,18 +129,18 @@ class Readings:
         self._strain_at = now
 
     def strain_at(self, now):
-        """Strains in the arm file's order, (gauges,); NaN where they are too old or never came."""
+        """Strains in the arm file's order, (gauges,); NaN if they are too old or never came."""
         if now - self._strain_at > self._strain_timeout:
             self.strain[:] = np.nan
         return self.strain
 
     def joints(self, message, field):
-        """Values of a field of a JointState, (n,); None where it is empty. Other joints in it are ignored.
+        """Values of a field of a JointState, (n,); None if it is empty. Other joints in the message are ignored.
 
         Raises
         ------
         MessageError
-            Where a joint of this arm or a value is missing.
+            If a joint of this arm or a value is missing.
         """
         if message.name != self._seen:
             missing = [n for n in self._names if n not in message.name]
@@ -164,7 +164,7 @@ class Readings:
 
 
 class AdapterNode(Driver):
-    """A driver whose samples are others' joint states, and whose torques are efforts of another controller."""
+    """A driver whose samples are others' joint states, and whose torques are the efforts of another controller."""
 
     def __init__(self):
         super().__init__("driver", PARAMETERS)
@@ -184,7 +184,7 @@ class AdapterNode(Driver):
         self._position = self._stamp = self._arrived = None
 
     def connect(self, torques):
-        # All topics are served alike: none of them is the control path alone.
+        # All topics are served in the same way: none of them alone is the control path.
         topic = self.parameters
         self._efforts = self.make_publisher(
             Float64MultiArray, topic["effort_topic"], qos.CONTROL_PATH
@@ -224,7 +224,7 @@ class AdapterNode(Driver):
             self.watch()
 
     def _sample(self, msg, stamp):
-        """A message as a sample; None where it was sent again."""
+        """A message as a sample; None if it was sent again."""
         readings, now = self._readings, self.now()
         position = readings.joints(msg, "position")
         velocity, effort = readings.joints(msg, "velocity"), readings.joints(msg, "effort")
@@ -248,7 +248,7 @@ class AdapterNode(Driver):
         self.begin_session()
 
     def _note_velocity(self, position, velocity, stamp, now):
-        """Keep the newest velocity for damping; where it is not measured, from the positions."""
+        """Keep the newest velocity for damping; if it is not measured, compute it from the positions."""
         if velocity is None and self._stamp is not None:
             velocity = (position - self._position) / (1e-9 * (stamp - self._stamp))
         if velocity is not None and np.isfinite(velocity).all():
@@ -261,7 +261,7 @@ class AdapterNode(Driver):
         self._send(torque)
 
     def make_safe(self):
-        """Damp each joint; zero efforts where its velocity is no longer known."""
+        """Damp each joint; send zero efforts if the velocity is no longer known."""
         self._settle(True)
         known, soft = self.now() - self._moved_at <= self.gate.timeout, self._soft
         damping, velocity = self._damping * known, self._velocity

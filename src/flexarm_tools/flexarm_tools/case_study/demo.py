@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm demo``: all runs of the case study, figures, bags, report, and the tables. ROS only for the nodes."""
+"""``flexarm demo``: makes all runs of the case study, figures, bags, report, and the tables. ROS only for the nodes."""
 
 import functools
 import json
@@ -28,9 +28,9 @@ from flexarm_studies.workers import processes
 
 #: Round trips of each of the two relays.
 RELAYED = 1500
-#: The run whose time per sample is compared with the relay's: it runs alone, the others two at a time.
+#: The run whose time per sample is compared with that of the relay: it runs alone, the others two at a time.
 TIMED = RUNS[-1]
-#: Runs of this arm, whose gain is a misprint, are in one process: nodes take longer for the same samples.
+#: Runs of this arm, whose gain is a misprint, are in one process, because nodes take longer for the same samples.
 IN_ONE_PROCESS = "P3_h11"
 
 
@@ -42,7 +42,7 @@ def demo(directory, show, nodes=True, as_json=False):
     directory : Path
         Results go here.
     show : Progress
-        Where to say what is going on.
+        Shows what is going on.
     nodes : bool
         Three processes over DDS; False: the loop without ROS.
     as_json : bool
@@ -51,7 +51,7 @@ def demo(directory, show, nodes=True, as_json=False):
     Returns
     -------
     dict
-        What ``summary.json`` holds.
+        The content of ``summary.json``.
     """
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run of the case study with simulator, observer and controller as three processes over DDS."""
+"""Runs the case study with simulator, observer and controller as three processes over DDS."""
 
 import shutil
 
@@ -44,7 +44,7 @@ def run_nodes(run, directory, progress=lambda fraction: None):
     Raises
     ------
     FlexarmError
-        Where a node fails, or the arm is lost.
+        If a node fails, or the arm is lost.
     """
     with own_domain() as domain, Processes(domain, directory / "log") as processes:
         start_nodes(processes, run)

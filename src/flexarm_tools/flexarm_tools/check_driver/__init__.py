@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a driver keeps its contract (`docs/driver.md`): messages judged, the arm pushed; ROS in `command` alone."""
+"""Checks whether a driver keeps its contract (`docs/driver.md`), by messages and by pushes; ROS only in `command`."""

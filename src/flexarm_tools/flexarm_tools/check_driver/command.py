@@ -16,13 +16,13 @@ from . import moving
 from .listening import Tolerances, check_layout, check_listening
 from .samples import Finding, Received, Verdict, samples
 
-#: Half the duration of a jolt forth and back; time for which torques that must be refused are sent [s].
+#: Half the duration of a jolt forth and back; duration for which torques that must be refused are sent [s].
 JOLT, REFUSED = 0.15, 0.15
 #: Time for which states are answered with DISABLED before a push, so that they name this program [s].
 CLAIM = 0.05
 #: Attempts at a push, when too many samples were lost to judge it.
 TRIES = 3
-#: Wall time that a phase may take beyond its own: in addition [s], and as a factor.
+#: Wall time that a phase may take beyond its own duration: an addition [s], and a factor.
 PATIENCE, SLOW = 2.0, 5.0
 
 
@@ -93,7 +93,7 @@ class Conversation:
     def listen(self, seconds, answer=None):
         """Return the states of `seconds` of the driver's time; call `answer` with the time and message of each.
 
-        When the stamps stand still, wall time ends it.
+        If the stamps stand still, wall time ends it.
         """
         start, first = len(self.received), None
         reached = 0.0
@@ -129,7 +129,7 @@ class Conversation:
         self.send(message, np.zeros(len(self._arm.joints)), mode=self._kind.DISABLED)
 
     def claim(self):
-        """Answer states with DISABLED for a while, so that the driver expects torque from here; what has come."""
+        """Answer states with DISABLED for a while, so the driver expects torque from here; return what has come."""
         return self.listen(CLAIM, lambda _, message: self.disable(message))
 
     def alone(self):
@@ -146,7 +146,7 @@ class Conversation:
 
 
 def not_alone():
-    """The error when a controller runs while the arm is to be pushed."""
+    """The error for a controller that runs while the arm is to be pushed."""
     hint = "stop it before the arm is pushed"
     return FlexarmError("a controller sends it", field="joint_torque", hint=hint)
 
@@ -209,7 +209,7 @@ class Examination:
         return push
 
     def _pushed(self, joint, angle):
-        """Push a joint once; return the push, its samples and the torque sent."""
+        """Push a joint once; return the push, its samples and the sent torque."""
         position = np.array(self._samples(self.driver.claim()).position[-1])
         push = moving.plan(self.model, position, joint, angle)
         sequences, torques = [], []
@@ -268,7 +268,7 @@ class Examination:
 
 
 def merged(findings):
-    """The worst finding of each check, in the order in which the checks first came."""
+    """The worst finding of each check, in the order of the first finding of each check."""
     rank = [Verdict.SKIPPED, Verdict.PASS, Verdict.WARN, Verdict.FAIL]
     out = {}
     for f in findings:

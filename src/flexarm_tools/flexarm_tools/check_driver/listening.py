@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of a driver by listening: names, numbers, time, counts, strain of an arm at rest.
+"""Checks a driver by listening: names, numbers, time, counts, strain of an arm at rest.
 
-Every check takes `Samples` and returns one `Finding`; none waits, moves the arm or needs ROS. They judge medians and
-minima, so that a driver does not fail because this machine was too busy to read it.
+Every check takes `Samples` and returns one `Finding`. No check waits, moves the arm or needs ROS. They judge medians
+and minima, so a driver does not fail because this machine was too busy to read it.
 """
 
 from dataclasses import dataclass
@@ -190,9 +190,9 @@ def check_stamps(samples, tolerances):
     least = float(age.min())
     if least < -1e-3:
         text = f"stamps are up to {-least:.3g} s in the future: use the time of measurement, on this clock"
-        # A few come while the device's clock is still being compared with this one.
+        # A few samples come while the device's clock is still being compared with this one.
         return Finding("stamps", FAIL if np.median(age) < -1e-3 else WARN, text)
-    # The minimum: the driver is not blamed for what a busy machine adds.
+    # The minimum: a busy machine's delay must not count against the driver.
     if least > tolerances.age:
         text = (
             f"stamps are at least {least:.3g} s old when they arrive, allowed are {tolerances.age:g} s:"
@@ -359,7 +359,7 @@ def check_frozen_strain(arm, samples, span=None):
     if span is None:
         moves = np.ptp(samples.position, axis=0).max() > MOTION
         span = np.full(len(arm.gauges), np.inf if moves else 0.0)
-    # A coarse bridge may round all readings to one count.
+    # A coarse bridge may round all readings to the same count.
     tells = span > 8.0 * np.array([g.uncertainty for g in arm.gauges])
     if not tells.any():
         return Finding(name, SKIPPED, "the arm did not bend enough: try --allow-motion")

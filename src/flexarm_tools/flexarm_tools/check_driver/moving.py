@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Checks of a driver by a small push: signs, scales and order of joints, gauges and modes, against the model.
+r"""Checks a driver by a small push: signs, scales and order of joints, gauges and modes, against the model.
 
 Joint j is pushed by one period of a sine,
 
 .. math:: u(t) = \bar u + A\,e_j\,\sin(2\pi t/T), \qquad B_{jj}\,A\,T^2/(2\pi) = \Delta q
 
-which leaves the slow subsystem (10) at rest, :math:`\Delta q` further; :math:`\bar u` holds the arm's weight. T is
-long compared with the links' slowest period. The model of the arm file moves under the same torque, by the driver's
-stamps and the torque it reports. Each measured signal y is compared with its prediction p: the factor
+which leaves the slow subsystem (10) at rest, :math:`\Delta q` further; :math:`\bar u` holds the arm's weight. T is long
+compared with the longest period of the links. The model of the arm file moves under the same torque, with the driver's
+stamps and the torque that it reports. Each measured signal y is compared with its prediction p: the factor
 :math:`y^Tp/p^Tp` is 1 if they agree.
 """
 
@@ -49,9 +49,9 @@ class Push:
     duration : float
         T [s].
     hold : ndarray, shape (n,)
-        What holds the arm's weight [N m].
+        Torque that holds the arm's weight [N m].
     angle : float
-        Motion of the joint, by the slow subsystem [rad].
+        Motion of the joint, from the slow subsystem [rad].
     """
 
     joint: int
@@ -68,7 +68,7 @@ class Push:
         return out
 
     def jolt(self, time, part):
-        """Half the amplitude forth for `part` seconds, then back; it ends at rest after twice that, (n,) [N m]."""
+        """Half the amplitude forth for `part` seconds, then back; it ends at rest after twice that time, (n,) [N m]."""
         out = self.hold.copy()
         out[self.joint] += 0.5 * self.amplitude * (1.0 if time < part else -1.0)
         return out
@@ -81,7 +81,7 @@ def plan(model, position, joint, angle=0.05):
     ----------
     model : ArmModel
     position : ndarray, shape (n,)
-        Where the arm is [rad].
+        Position of the arm [rad].
     joint : int
     angle : float
     """
@@ -157,8 +157,8 @@ def replay(model, samples, sent, reported_holds):
     sent : ndarray, shape (N, n)
         See `sent_torque`.
     reported_holds : bool
-        Whether the reported torque was applied; otherwise `sent` was. Where the reported one is zero though torque was
-        sent, the driver took the safe action, and so does the model.
+        Whether the reported torque was applied; otherwise `sent` was applied. Where the reported torque is zero
+        although torque was sent, the driver took the safe action, and so does the model.
 
     Returns
     -------
@@ -381,7 +381,7 @@ def check_push(model, push, samples, sent, tolerances):
             " can't be judged: lower the rate, or give the machine more time"
         )
         return [Finding("response", SKIPPED, text)]
-    # `check_finite` has reported the others.
+    # `check_finite` has already reported the others.
     kept = {k: getattr(samples, k) for k in ("velocity", "strain", "amplitude")}
     kept = {k: v if v is None or np.isfinite(v).all() else None for k, v in kept.items()}
     samples = replace(samples, **kept)
@@ -393,7 +393,7 @@ def check_push(model, push, samples, sent, tolerances):
     response = check_response(arm, push, samples, position, tolerances.gain)
     findings = [reported, response, velocity]
     if response.verdict == FAIL:
-        # When the arm does not move as its model, its strains would be blamed for it.
+        # If the arm does not move like its model, its strains would seem wrong.
         return findings
     findings += check_strain_response(model, samples, deflection, tolerances.gain)
     findings.append(check_modes(model, samples, deflection, tolerances.gain))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded `ArmState` messages as arrays, and what a check finds."""
+"""Holds recorded `ArmState` messages as arrays, and what a check finds."""
 
 from dataclasses import dataclass
 from enum import Enum

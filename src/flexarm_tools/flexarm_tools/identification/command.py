@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm identify``: a recorded motion and an arm file in; parameters with intervals, an arm file and a plot out."""
+"""``flexarm identify``: recorded motion and arm file in; parameters with intervals, an arm file and a plot out."""
 
 import json
 import sys
@@ -67,7 +67,7 @@ def add_arguments(parser):
 
 
 def identify(options):
-    """Run ``identify``; the result as plain data."""
+    """Run ``identify``; return the result as plain data."""
     if (options.live is None) == (options.recording is None):
         raise FlexarmError("give either a bag or CSV file, or --live SECONDS")
     if not options.undetermined > 0.0:
@@ -117,7 +117,7 @@ def identify(options):
 
 
 def without_torque(options, arm, measured, progress, out):
-    """Fit the strains alone; the result as plain data."""
+    """Fit the strains alone; return the result as plain data."""
     found, result, (run, predicted) = strains.identify(options, arm, measured, progress)
     progress.done()
     if out:
@@ -218,7 +218,7 @@ def text_of(result):
 
 
 def draw(found, measured, path):
-    """Draw measured, fitted and residual signals; the path."""
+    """Draw measured, fitted and residual signals; return the path."""
     from flexarm_studies.commands.options import check_file
     from flexarm_studies.plotting import plt, save
 

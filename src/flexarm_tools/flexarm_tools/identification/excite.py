@@ -15,7 +15,7 @@ from flexarm_studies.progress import Progress
 
 from .live import PATIENCE, START_DRIVER
 
-#: Timeout for the next state; after it the arm counts as lost [s].
+#: Timeout for the next state; after this time the arm counts as lost [s].
 SILENCE = 10.0
 #: This process's node.
 RECORDER = "excite_recorder"
@@ -50,12 +50,12 @@ def add_arguments(parser):
 
 
 def excite(options):
-    """Run ``excite``; the bag's path.
+    """Run ``excite``; return the bag's path.
 
     Raises
     ------
     FlexarmError
-        When the arm must not move, no driver answers, or the excitation was stopped; what came before is kept.
+        If the arm must not move, no driver answers, or the excitation was stopped; what came before is kept.
     """
     from rclpy.serialization import deserialize_message
 
@@ -69,7 +69,7 @@ def excite(options):
         raise FlexarmError("this moves the arm", hint="stand clear, and give --allow-motion")
     out = new_path(options.out, "--out")
     out.parent.mkdir(parents=True, exist_ok=True)
-    arm_file.load(options.arm)  # refused here, and not in another process's log
+    arm_file.load(options.arm)  # refuse it here, and not in another process's log
     with Session(RECORDER, namespace=options.namespace) as session:
         recorder = Recorder(session, ("arm_state", "joint_torque"))
         session.wait_for("arm_state", lambda: recorder.raw["arm_state"], PATIENCE, START_DRIVER)
@@ -83,7 +83,7 @@ def excite(options):
         enabled = [stamp_ns(m.header.stamp) for m in torques if m.mode == m.ENABLED]
         if not enabled:
             raise FlexarmError(f"no torque was sent:\n{output}")
-        # Before and after these the safe action moves the arm, and no message holds its torque.
+        # Before and after these the safe action moves the arm, and no message contains its torque.
         kept = recorder.between(min(enabled), max(enabled))
     write_bag(out, kept, options.arm)
     count = len(kept["arm_state"])
@@ -99,7 +99,7 @@ def node_parameters(options):
     """Parameters of the node, from the options; name to value."""
     from ..recording.recorder import KEPT
 
-    # The driver, and this recorder, which is to get every torque even if the machine leaves it waiting.
+    # The driver, and this recorder, which must get every torque even if the machine is busy.
     values = {"arm": str(arm_file.find(options.arm)), "readers": 2, "recorder": RECORDER}
     topic = "/".join(("", options.namespace.strip("/"), "joint_torque")).replace("//", "/")
     values |= {f"qos_overrides.{topic}.publisher.depth": KEPT}
@@ -108,7 +108,7 @@ def node_parameters(options):
 
 
 def _run(options, session):
-    """Run the node until it reports its end; its output."""
+    """Run the node until it reports its end; return its output."""
     from ..running.processes import arguments, executable
 
     values = node_parameters(options)

@@ -7,17 +7,17 @@ from flexarm_dynamics.errors import FlexarmError
 PATIENCE = 10.0
 #: Longest recording [s].
 MAX_SECONDS = 3600.0
-#: What a user can do when no state arrives.
+#: What a user can do if no state arrives.
 START_DRIVER = "start the driver (or simulator)"
 
 
 def record(arm, seconds, namespace=""):
-    """A `Recording` of so many seconds, by the stamps, of a running arm.
+    """Make a `Recording` of a running arm over `seconds`, by the stamps.
 
     Raises
     ------
     FlexarmError
-        When no states arrive, or they stop.
+        If no states arrive, or if they stop.
     """
     from flexarm_ros.session import Session
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm identify --report``: a fit on one page of HTML, in the style of ``flexarm report``."""
+"""``flexarm identify --report``: writes a fit on one page of HTML, in the style of ``flexarm report``."""
 
 import json
 from pathlib import Path
@@ -19,18 +19,18 @@ DEGREES, MICRO = 180.0 / np.pi, 1e6
 LAGS, SEGMENT = 60, 512
 #: A modelled frequency is near the measured one within this fraction, a damping ratio within this factor [-].
 NEAR, DAMPED = 0.02, 1.5
-#: Names along the matrix of correlations at most.
+#: Max. number of names along the matrix of correlations.
 MAX_NAMES = 45
 
 
 def write(found, run, predicted, result, path):
-    """Write the page; its path.
+    """Write the page; return its path.
 
     Parameters
     ----------
     found : Identified or StrainFit
     run : Recording
-        What was predicted.
+        The recording that was predicted.
     predicted : ndarray, shape (s, n + g) or (s, g)
         Joint angles and strains, or strains alone, at the samples of the `run`.
     result : dict
@@ -107,7 +107,7 @@ def _page(found, run, shown, result):
 
 
 def _places(channel):
-    """Decimals with which a channel is written: about 10^-5 of what it moves by."""
+    """Decimals with which a channel is written: about 10^-5 of its range."""
     size = np.nanmax(np.abs(channel["measured"]), initial=1e-9)
     return int(np.clip(5 - np.floor(np.log10(size)), 0, 8))
 
@@ -117,7 +117,7 @@ def _rounded(values, places):
 
 
 def _spans(result):
-    """Name, beginning and end [s] of the fitted and of the scored part, as far as they are of this recording."""
+    """Name, beginning and end [s] of the fitted and of the scored part, if they are of this recording."""
     spans = [("fit", result.get("fit_s"))]
     if not result.get("score_file"):
         spans.append(("score", result.get("score_s")))
@@ -196,7 +196,7 @@ def _parameter(row):
 
 
 def _drawn(draw, name, rows):
-    """SVG of a figure with so many rows of two panels, drawn by ``draw(axes)``."""
+    """SVG of a figure with `rows` rows of two panels, drawn by ``draw(axes)``."""
     with plt.rc_context(figures.STYLE):
         figure, axes = plt.subplots(
             rows, 2, figsize=(figures.WIDTH, 1.7 * rows + 0.6), squeeze=False, layout="constrained"
@@ -206,7 +206,7 @@ def _drawn(draw, name, rows):
 
 
 def _spectra(axes, shown, period):
-    """Spectra of what was measured and of the residual, and the residual's correlation over time."""
+    """Spectra of the measured signals and of the residuals, and the residuals' correlation over time."""
     from scipy.signal import welch
 
     for row, channel in zip(axes, shown, strict=True):
@@ -232,7 +232,7 @@ def _spectra(axes, shown, period):
 
 
 def _correlation(found):
-    """SVG of the matrix of correlations of the fitted parameters; None where there are none, or too many."""
+    """SVG of the matrix of correlations of the fitted parameters; None if there are none, or too many."""
     fitted, rho = advice.correlations(found)
     if not 1 < len(fitted) <= MAX_NAMES:
         return None
@@ -249,7 +249,7 @@ def _correlation(found):
 
 
 def _closed(figure, name):
-    """SVG of a figure that is not needed any more."""
+    """SVG of a figure, which is then closed."""
     text = figures.svg(figure, name)
     plt.close(figure)
     return text

@@ -12,12 +12,12 @@ from flexarm_studies.identification.recording import from_tables, read_csv
 
 
 def of_contents(contents, arm=None):
-    """The `Recording` in a bag's `contents`; without an `arm`, with the names that the bag has.
+    """The `Recording` in a bag's `contents`; without an `arm`, it has the names in the bag.
 
     Raises
     ------
     FlexarmError
-        When there are no usable states, or gauges of another arm.
+        If there are no usable states, or gauges of another arm.
     """
     unknown = contents.unknown.get("gauge_names")
     if unknown and arm is not None:
@@ -30,13 +30,13 @@ def of_contents(contents, arm=None):
 
 
 def read(path, arm=None, mapping=None, namespace=""):
-    """A `Recording` of a bag or a CSV file, by what `path` is.
+    """Read a `Recording` from a bag or a CSV file, whichever `path` is.
 
     Parameters
     ----------
     path : str or Path
     arm : Arm, optional
-        Whose names and order are wanted; those of the recording if not given.
+        Gives the names and their order; if not given, those of the recording are used.
     mapping : Mapping, optional
         What the columns of a CSV file are, see `recordings.mapping`.
     namespace : str

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm identify`` of a recording without torque: options, text and plain data of a fit to the strains alone."""
+"""``flexarm identify`` for recordings without torque: options, text and plain data of a fit to the strains alone."""
 
 import functools
 import os
@@ -20,9 +20,9 @@ from flexarm_studies.recordings.motion import CORNER
 
 from . import recording as recordings
 
-#: A variance accounted for below this is not written out [%]: a regression that went astray.
+#: A variance accounted for below this is not written out [%]: the regression has diverged.
 LEAST = -99.0
-#: Microstrain in a strain.
+#: Microstrain per unit of strain.
 MICRO = 1e6
 
 
@@ -106,7 +106,7 @@ def asked(options):
 
 
 def identify(options, arm, measured, progress):
-    """Fit and score: the `StrainFit`, plain data, and the run with its prediction.
+    """Fit and score; return the `StrainFit`, plain data, and the run with its prediction.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def identify(options, arm, measured, progress):
 
 
 def summary(found, measured, source):
-    """Plain data of a fit: parameters with origin and interval, and what strains do not tell."""
+    """Plain data of a fit: parameters with origin and interval, and what strains do not determine."""
     rows = []
     for q, value, width in zip(found.quantities, found.values, found.half_widths, strict=True):
         kept = bool(np.isnan(width))
@@ -278,7 +278,7 @@ def heading(result):
 
 
 def origins(result):
-    """Name of a quantity to what is to stand beside its number."""
+    """Name of a quantity to the text beside its number."""
     notes = {}
     for row in result["parameters"]:
         if row["half_width"] is not None:
@@ -289,7 +289,7 @@ def origins(result):
 
 
 def for_file(found):
-    """A fit as `rewritten` takes it: without what belongs to the recording alone."""
+    """A fit as `rewritten` takes it, without what belongs to the recording alone."""
     keep = [j for j, q in enumerate(found.quantities) if q.kind not in ("delay", "drift")]
     return replace(
         found,
@@ -300,9 +300,9 @@ def for_file(found):
 
 
 def draw(found, run, predicted, result, path):
-    """Draw measured, predicted and residual strains of the part that was not fitted, or of all; the path.
+    """Draw measured, predicted and residual strains of the part that was not fitted, or of all; return the path.
 
-    `run` is the recording of the prediction; `found`, `predicted` (s, g) and `result` are of `identify`.
+    `run` is the recording of the prediction; `found`, `predicted` (s, g) and `result` are those of `identify`.
     """
     from flexarm_studies.commands.options import check_file
     from flexarm_studies.plotting import plt, save
@@ -330,7 +330,7 @@ def draw(found, run, predicted, result, path):
 
 
 def other_part(result):
-    """Whether a part of the same recording was scored: what there is a prediction to draw of."""
+    """Whether a part of the same recording was scored; there is a prediction to draw for it."""
     return "score" in result["parts"] and not result.get("score_file")
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads an arm's topics from a bag of any length, as columns of numbers.
 
-The columns are kept in files, so that memory holds only a block of messages at a time. A bag may come from anywhere:
-topics may be missing or in a namespace, names in another order, arrays empty, the file truncated. What can't be used
-is left out, and a note says so.
+The columns are kept in files, so memory holds only a block of messages at a time. A bag may come from anywhere: topics
+may be missing or in a namespace, names in another order, arrays empty, the file truncated. What can't be used is left
+out, and a note reports it.
 """
 
 import tempfile
@@ -21,7 +21,7 @@ from . import mcap
 from .serialised import Decoder
 from .types import ARM_NAME, ARM_TEXT
 
-#: Fields of each topic, and whose names give their order; None: a single number.
+#: Fields of each topic, and the names that give their order; None: a single number.
 _STATE = {
     "joint_position": "joint_names",
     "joint_velocity": "joint_names",
@@ -55,11 +55,11 @@ KINDS = {
     "controller/state": "flexarm_msgs/msg/CompositeState",
     "observer/state": "flexarm_msgs/msg/ObserverState",
 }
-#: What every table has beside its fields, and as what.
+#: Columns that every table has beside its fields, and their types.
 _HEAD = {"stamp": np.int64, "session": np.int64, "sequence": np.int64, "reason": np.int32}
 #: Number of messages, or of bytes, that are read before they are put into columns.
 BLOCK, BLOCK_BYTES = 40_000, 32_000_000
-#: Different reasons of refusal that are kept.
+#: Number of different reasons of refusal that are kept.
 MAX_REASONS = 500
 
 
@@ -74,9 +74,9 @@ class Table:
     columns : dict
         Field to an array (k, width), NaN where a message has none; float64.
     known : set
-        Fields that some message has a value of.
+        Fields of which some message has a value.
     reason : ndarray of int, shape (k,)
-        Which of the bag's `reasons`; -1 where there is no such field.
+        Index into the bag's `reasons`; -1 where there is no such field.
     """
 
     stamp: np.ndarray
@@ -89,23 +89,23 @@ class Table:
 
 @dataclass
 class Contents:
-    """What a bag holds of one arm.
+    """The content of a bag for one arm.
 
     Attributes
     ----------
     path : Path
     namespace : str
-        Such as ``/left``; empty where there is none.
+        Such as ``/left``; empty if there is none.
     arm : Arm or None
     names : dict
         ``joint_names``, ``gauge_names`` and ``mode_names``, in the order of the columns.
     tables : dict
-        Topic to `Table`; without the topics of which there is no message.
+        Topic to `Table`, for topics that have a message.
     reasons : list of str
     notes : list of str
         What was left out, and why.
     unknown : dict
-        ``gauge_names`` and the like to a list of those that are not the arm's; their values are left out.
+        ``gauge_names`` and the like to a list of names that the arm does not have; their values are left out.
     """
 
     path: Path
@@ -119,7 +119,7 @@ class Contents:
 
 
 class _Columns:
-    """Columns that are appended to, each in a file without a name, which is gone when nothing refers to it."""
+    """Columns to which rows are appended, each in a nameless file; it vanishes when nothing refers to it."""
 
     def __init__(self):
         self._files = {}
@@ -134,7 +134,7 @@ class _Columns:
         self._files[name][0].write(np.ascontiguousarray(values).tobytes())
 
     def pad(self, name, rows, width):
-        """NaN for the messages that came before the first one from which the width is known."""
+        """Write NaN for the messages before the first one that shows the width."""
         if name not in self._files and rows:
             self.append(name, np.full((rows, width), np.nan))
 
@@ -159,9 +159,9 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
     arm : Arm or str, optional
         Arm or arm file; the bag's own if not given.
     namespace : str, optional
-        Of the one arm that is wanted; not given: all that are there.
+        Namespace of the wanted arm; not given: all arms in the bag.
     progress : callable
-        Called with the fraction that is read.
+        Called with the fraction that has been read.
 
     Returns
     -------
@@ -171,7 +171,7 @@ def read(path, arm=None, namespace=None, progress=lambda fraction: None):
     Raises
     ------
     FlexarmError
-        For what is no bag, has none of the topics, or belongs to another arm.
+        If it is not a bag, has none of the topics, or belongs to another arm.
     """
     path, notes = bag_path(Path(path)), []
     if isinstance(arm, str):
@@ -210,12 +210,12 @@ def from_messages(raw, arm):
 
 
 def bag_path(path):
-    """The bag that a `path` means.
+    """The bag to which a `path` refers.
 
     Raises
     ------
     FlexarmError
-        Where there is none.
+        If there is none.
     """
     if not path.exists():
         raise FlexarmError("no such file or folder", field=str(path))
@@ -238,7 +238,7 @@ def _is_bag(path):
 
 
 def arm_of(path, notes):
-    """The arm in a bag's metadata; None without one."""
+    """The arm in a bag's metadata; None if there is none."""
     place = (path if path.is_dir() else path.parent) / "metadata.yaml"
     try:
         data = yaml.safe_load(place.read_text(encoding="utf-8"))
@@ -273,14 +273,14 @@ class Source:
     path : Path
         As of `bag_path`.
     notes : list of str
-        To which it adds what was left out.
+        List to which it adds what was left out.
 
     Attributes
     ----------
     topics : dict
         Topic to the type of its messages, once they are read.
     count : int
-        Of the messages that are wanted; 0 where the bag does not have it.
+        Number of the wanted messages; 0 if the bag does not have it.
     """
 
     def __init__(self, path, notes):
@@ -292,7 +292,7 @@ class Source:
         Raises
         ------
         FlexarmError
-            For what can't be read as a bag.
+            If it can't be read as a bag.
         """
         given, problem = 0, None
         try:
@@ -340,7 +340,7 @@ class Source:
 
 
 def _nothing(path, source, namespace):
-    """The error where a bag holds no message that is wanted."""
+    """The error for a bag without any wanted message."""
     if any(_wanted(t, k, None) for t, k in source.topics.items()) and namespace is None:
         hint = "record while the nodes run, with `flexarm record`"
         return FlexarmError("the bag is empty", field=str(path), hint=hint)
@@ -355,7 +355,7 @@ def _nothing(path, source, namespace):
 
 
 def _enough(contents, others):
-    """Whether there are states of an arm; refuse a bag without."""
+    """Whether there are states of an arm; refuse a bag without them."""
     if "arm_state" in contents.tables or "arm_state_estimate" in contents.tables:
         return True
     if others > 1:
@@ -463,7 +463,7 @@ class _Reader:
             self._known[topic].add(name)
 
     def _ours(self, topic, layout, count):
-        """Whether a layout's joints are this arm's."""
+        """Whether the joints of a layout are those of this arm."""
         have, wanted = layout.names.get("joint_names"), self.names.get("joint_names")
         if have is None or not wanted or sorted(have) == sorted(wanted):
             return True

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag of the loop without ROS: the messages that the nodes would send, by the nodes' own writers.
+"""Writes a bag of the loop without ROS: the messages that the nodes would send, made by the nodes' own writers.
 
-Nothing is sent: no middleware is started. Stamps are the simulator's, and so are the times in the bag.
+Nothing is sent: no middleware is started. The stamps and the times in the bag are those of the simulator.
 """
 
 import math
@@ -20,7 +20,7 @@ from .recorder import BagWriter
 
 
 class LoopBag:
-    """Writes what a `ClosedLoop` does at every sample; a context.
+    """Writes what a `ClosedLoop` does at every sample; a context manager.
 
     Parameters
     ----------
@@ -50,12 +50,12 @@ class LoopBag:
             self._put("arm_state", _fill(self._measured, sample, sample, sample.rate))
 
     def answered(self, sample, enabled):
-        """Write what observer and controller made of a sample."""
+        """Write what observer and controller computed from a sample."""
         loop, core, key = self._loop, self._loop.observer, sample.key
         if (*key, loop.controller.reason) == self._answered:
             return
         self._answered = (*key, loop.controller.reason)
-        if loop.estimated.key == key:  # else the observer has refused it
+        if loop.estimated.key == key:  # otherwise the observer has refused it
             message = _fill(self._estimate, sample, core, loop.estimated.rate)
             self._put("arm_state_estimate", message)
             health = core.gauges and core.gauges.health

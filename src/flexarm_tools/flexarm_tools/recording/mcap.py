@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads an MCAP file up to where it is truncated: a recording that was never closed has no index.
+"""Reads an MCAP file, also a truncated one: a recording that was never closed has no index.
 
-The format is a magic number, then records of one byte of kind, eight of length and the content; messages stand in
-chunks, which may be compressed, or by themselves: the specification at mcap.dev.
+The format is a magic number, then records: one byte for the kind, eight for the length, and the content. Messages are
+in chunks, which may be compressed, or outside of chunks. The specification is at mcap.dev.
 
-Why not the library: `mcap` 1.6's stream reader takes four times as long and loses a truncated chunk. A bag of 100 s of
-the five topics at 1 kHz (502 800 messages, 125 MB) takes it 2.1 s of processor time, this one 0.5 s; of the same file
-cut off at 62 % it returns 306 821 messages, this one 311 066.
+Why not the library: `mcap` 1.6's stream reader takes four times as long and loses a truncated chunk. For a bag of 100 s
+of the five topics at 1 kHz (502 800 messages, 125 MB) it takes 2.1 s of processor time, this reader 0.5 s. From the
+same file, cut off at 62 %, it returns 306 821 messages, this reader 311 066.
 """
 
 import struct
@@ -15,7 +15,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
-#: A record whose length is given as more than this is not one [bytes].
+#: What states a larger length than this is not a record [bytes].
 MAX_LENGTH = 1 << 31
 
 
@@ -25,7 +25,7 @@ def messages(path):
     Raises
     ------
     FlexarmError
-        When the file does not begin as MCAP does.
+        If the file does not begin like an MCAP file.
     """
     with open(path, "rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -35,7 +35,7 @@ def messages(path):
 
 
 def _records(read):
-    """Yield (kind, content) of the records that are whole."""
+    """Yield (kind, content) of the complete records."""
     while True:
         head = read(9)
         if len(head) < 9:
@@ -45,7 +45,7 @@ def _records(read):
             return
         content = read(length)
         if len(content) < length:
-            # What a chunk that breaks off holds, as far as it goes, when it is not compressed.
+            # The readable part of a chunk that breaks off, if it is not compressed.
             if kind == _CHUNK:
                 yield kind, content
             return
@@ -72,7 +72,7 @@ def _of(records, kinds, channels):
 
 
 def _reader(data):
-    """A function that reads on in some bytes."""
+    """A function that reads bytes one after the other."""
     at = 0
 
     def read(size):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm record``: a bag of a running arm, of a driver or of the simulator alike.
+"""``flexarm record``: records a bag of a running arm, of a driver as well as of the simulator.
 
-It writes each message of the arm's topics as it arrives, so that memory stays small in a recording of any length. It
+It writes each message of the arm's topics as it arrives, so memory use stays small in a recording of any length. It
 asks the nodes for the arm's name and puts the text of the arm file into the bag.
 """
 
@@ -16,7 +16,7 @@ from flexarm_studies.commands.options import new_path
 
 #: Timeout for the first message [s].
 PATIENCE = 10.0
-#: Time between two looks at the middleware's queues, and between two lines on a terminal [s].
+#: Time between two checks of the middleware's queues, and between two lines on a terminal [s].
 POLL_PERIOD, SHOW_PERIOD = 0.005, 0.5
 #: Nodes that know the arm; the first answer is taken.
 ASKED = ("observer", "controller", "observer_controller", "simulator")
@@ -40,12 +40,12 @@ def add_arguments(parser):
 
 
 def record(options):
-    """Run ``record``; the bag's folder.
+    """Run ``record``; return the bag's folder.
 
     Raises
     ------
     FlexarmError
-        When nothing comes, or for a folder that exists.
+        If nothing comes, or if the folder exists.
     """
     duration = options.duration
     if duration is not None and not duration > 0.0:
@@ -63,7 +63,7 @@ def record(options):
 
 
 def _take(listener, out, arm, duration, as_json=False):
-    """Record until the duration is over, Ctrl-C or SIGTERM; what was counted."""
+    """Record until the duration is over, Ctrl-C or SIGTERM; return what was counted."""
     from .recorder import BagWriter
 
     began, shown, ended = time.monotonic(), 0.0, None
@@ -79,7 +79,7 @@ def _take(listener, out, arm, duration, as_json=False):
                 if time.monotonic() > shown + SHOW_PERIOD:
                     shown = time.monotonic()
                     taken.show(shown - began)
-        except (KeyboardInterrupt, SystemExit) as end:  # Ctrl-C, the way to end it; SIGTERM
+        except (KeyboardInterrupt, SystemExit) as end:  # Ctrl-C, the normal end; SIGTERM
             ended = end
         taken.take(listener.poll(), time.time_ns())
     if sys.stderr.isatty():
@@ -117,7 +117,7 @@ class Taken:
                 self._from, self._to = self._from or now_ns, now_ns
 
     def put_arm(self, arm):
-        """Put the arm that a node has named into the bag, if its file is here."""
+        """Put the arm that a node has named into the bag, if its file is on this machine."""
         if not arm or arm == self._unusable:
             return
         try:
@@ -162,7 +162,7 @@ class Taken:
 
 
 class Listener:
-    """A session that collects an arm's topics and asks its nodes for the arm; a context."""
+    """A session that collects an arm's topics and asks its nodes for the arm; a context manager."""
 
     def __init__(self, namespace=""):
         from flexarm_ros.session import Session
@@ -187,7 +187,7 @@ class Listener:
         Raises
         ------
         FlexarmError
-            After so long, with the topics that there are.
+            After `seconds`, with the topics that exist.
         """
         if not self._session.serve(seconds, lambda: any(self._recorder.raw.values())):
             raise self._silence(seconds)
@@ -207,7 +207,7 @@ class Listener:
         return FlexarmError(f"no message of an arm in {where} for {seconds:g} s", hint=hint)
 
     def ask_arm(self):
-        """Ask the nodes for their parameter ``arm``; a function that returns it once it is known, else ''."""
+        """Ask the nodes for their parameter ``arm``; return a function that gives it, or '' while it is unknown."""
         from rcl_interfaces.srv import GetParameters
 
         questions = [

@@ -24,14 +24,14 @@ PUBLISHERS = {
 }
 
 
-#: Messages that a publisher keeps for a recorder that falls behind: ten seconds of a sample each millisecond.
+#: Messages that a publisher keeps for a recorder that falls behind: ten seconds with a sample each millisecond.
 KEPT = 10_000
 
 
 def keep_for_recording(node):
     """Parameters of a node whose messages are recorded.
 
-    On the control path a publisher keeps the newest sample alone. A recorder that falls behind on a busy machine gets
+    On the control path a publisher keeps only the newest sample. A recorder that falls behind on a busy machine gets
     what it missed only while the publisher still has it.
     """
     return {f"qos_overrides./{topic}.publisher.depth": KEPT for topic in PUBLISHERS[node]}
@@ -49,7 +49,7 @@ class Recorder:
     Parameters
     ----------
     session : Session
-        Whose `poll` collects them.
+        Its `poll` collects them.
     topics : sequence of str
         Of `TOPICS`.
     """
@@ -73,7 +73,7 @@ class Recorder:
         return raw_stamp_ns(newest) if newest else 0
 
     def between(self, begin_ns, end_ns):
-        """One message per stamp from `begin_ns` to `end_ns`; of one that was sent again, the last.
+        """One message per stamp from `begin_ns` to `end_ns`; if it was sent again, the last one.
 
         Returns
         -------
@@ -87,12 +87,12 @@ class Recorder:
         return kept
 
     def samples(self, begin_ns, end_ns):
-        """As `between`, from `begin_ns` to `end_ns`, of all topics the same samples.
+        """As `between`, from `begin_ns` to `end_ns`, with the same samples of all topics.
 
         Raises
         ------
         ProcessError
-            When a topic lacks a sample that another one has.
+            If a topic lacks a sample that another topic has.
         """
         kept = self.between(begin_ns, end_ns)
         stamps = set().union(*kept.values())
@@ -139,8 +139,8 @@ class BagWriter:
     path : Path
         Directory of the bag; must not exist.
     arm : str, optional
-        Shipped name or path of the arm file: its name and its text go into the bag's metadata (``custom_data``), so
-        that a reader of the bag knows the arm.
+        Shipped name or path of the arm file: its name and its text go into the bag's metadata (``custom_data``), so a
+        reader of the bag knows the arm.
     namespace : str
         In front of the topics' names.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads what any robot publishes: `sensor_msgs/JointState` and `sensor_msgs/Imu`, and strains of `ArmState`. No ROS."""
+"""Reads topics of any robot: `sensor_msgs/JointState` and `sensor_msgs/Imu`, and strains of `ArmState`. No ROS."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from .serialised import Decoder
 
 JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
 STATE = KINDS["arm_state"]
-#: Numbers after the joint names in a message, to what they are.
+#: Fields with numbers after the joint names in a message, to what they are.
 _FIELDS = {"position": "position", "velocity": "velocity", "effort": "torque"}
 
 
@@ -24,7 +24,7 @@ def kinds(path):
     Raises
     ------
     FlexarmError
-        For what is no bag.
+        If it is not a bag.
     """
     source = Source(bag_path(Path(path)), [])
     for _ in source.messages(lambda topic, kind: False):
@@ -44,7 +44,7 @@ def read(path, namespace=""):
     Raises
     ------
     FlexarmError
-        For what is no bag, has none of these topics, or has none that can be used.
+        If it is not a bag, has none of these topics, or has none that can be used.
     """
     inside, notes = f"/{namespace.strip('/')}/", []
     source = Source(bag_path(Path(path)), notes)
@@ -71,7 +71,7 @@ def of_messages(topic, kind, messages, notes):
         `JOINTS`, `IMU` or, for its strains, `STATE`.
     messages : list of bytes
     notes : list of str
-        To which it adds what was left out.
+        List to which it adds what was left out.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _stamps(layout, block):
 
 
 def _in_order(parts):
-    """Arrays of several groups, each with the rows that it has of the whole, in the order of these rows."""
+    """Join the arrays of several groups, each with its rows in the whole, in the order of these rows."""
     rows = np.concatenate([r for r, _ in parts])
     values = np.concatenate([v for _, v in parts])
     return values[np.argsort(rows)]
@@ -127,7 +127,7 @@ def _joints(topic, groups):
 
 
 def _imu(topic, groups):
-    """A `Stream` of an IMU; what it marks as not measured (covariance -1) is left out."""
+    """A `Stream` of an IMU; values that it marks as not measured (covariance -1) are left out."""
     time = _in_order([(rows, _stamps(layout, block)) for rows, layout, block in groups])
     found = []
     for field in ("linear_acceleration", "angular_velocity"):

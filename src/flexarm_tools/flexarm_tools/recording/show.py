@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm recording show``: what a bag or a CSV file holds, before anything is fitted to it."""
+"""``flexarm recording show``: shows what a bag or a CSV file contains, before anything is fitted to it."""
 
 import json
 
@@ -34,7 +34,7 @@ def add_arguments(parser):
 
 
 def recording(options):
-    """Run ``recording``; the summary as plain data."""
+    """Run ``recording``; return the summary as plain data."""
     arm = arm_file.load(options.arm) if options.arm else None
     mapping = mappings.of_options(options)
     measured = recordings.read(options.recording, arm, mapping, options.namespace)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What bags hold: message types of Jazzy and of flexarm, and the arm's file. No ROS."""
+"""Provides what bags contain: message types of Jazzy and of flexarm, and the arm's file. No ROS."""
 
 import functools
 from pathlib import Path
 
 from ..running.processes import installed
 
-#: Where the wheel for pip has the definitions of flexarm's messages; a workspace has them where colcon installs them.
+#: Folder of the definitions of flexarm's messages in the wheel for pip; in a workspace, colcon installs them elsewhere.
 BESIDE = Path(__file__).parent / "msg"
-#: What is written into a bag's metadata (``custom_data``): the arm's name, and the text of its file.
+#: Keys in a bag's metadata (``custom_data``): for the arm's name, and for the text of its file.
 ARM_NAME, ARM_TEXT = "flexarm.arm", "flexarm.arm_file"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording as a driver: `playback` orders its samples, `node` publishes them, `command` is ``flexarm replay``."""
+"""Plays a recording as a driver: `playback` orders samples, `node` publishes them, `command` is ``flexarm replay``."""
 
 from flexarm_ros.start import start
 

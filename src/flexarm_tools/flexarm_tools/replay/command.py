@@ -43,7 +43,7 @@ def add_arguments(parser):
 
 
 def replay(options):
-    """Run ``replay``; the exit code.
+    """Run ``replay``; return the exit code.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def replay(options):
     from ..running.processes import arguments
     from .node import ReplayNode
 
-    arm = arm_file.load(options.arm)  # refused here, and not in the node's log
+    arm = arm_file.load(options.arm)  # refuse it here, and not in the node's log
     for name, low in (("begin", 0.0), ("duration", 0.0), ("factor", 1e-3)):
         if not low <= getattr(options, name) <= 1e9:
             value, limit = getattr(options, name), f"at least {low:g}"

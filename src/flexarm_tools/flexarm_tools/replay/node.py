@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Node `replay`: a recording as a driver. What a controller sends is kept beside the measured torque, never applied."""
+"""Node `replay`: plays a recording as a driver; a controller's torques are kept beside the measured, not applied."""
 
 from flexarm_dynamics.errors import MessageError
 from flexarm_dynamics.parameters import parameter
@@ -14,23 +14,23 @@ from flexarm_studies.recordings import mapping as mappings
 from ..identification import recording as recordings
 from .playback import Playback, part
 
-#: What a sample waits for in lockstep.
+#: The answer for which a sample waits in lockstep.
 NONE, OBSERVER, CONTROLLER = "none", "observer", "controller"
-#: In lockstep a sample without an answer is sent again after so long (wall time), and this is reported after [s].
+#: In lockstep: wall time after which a sample without an answer is sent again, and after which this is reported [s].
 RESEND, UNANSWERED = 0.1, 5.0
-#: The first sample waits so long for a subscription [s].
+#: Time for which the first sample waits for a subscription [s].
 LISTENERS = 2.0
 
 OWN = (
     parameter("recording", "", read_only=True).described("A bag's folder, or a CSV file."),
     parameter("mapping", "", read_only=True).described(
-        "What the columns of a CSV file are: a mapping file, by path or shipped name."
+        "Mapping file, by path or shipped name, with the meaning of the columns of a CSV file."
     ),
     parameter("begin", 0.0, "s", 0.0, 1e9, read_only=True).described(
-        "Where in the recording to begin, after its first sample."
+        "Time after the recording's first sample at which to begin."
     ),
     parameter("duration", 0.0, "s", 0.0, 1e9, read_only=True).described(
-        "How long to play; 0.0: to the recording's end."
+        "Duration that is played; 0.0: to the recording's end."
     ),
     parameter("lockstep", NONE, choices=(NONE, OBSERVER, CONTROLLER), read_only=True).described(
         "Each sample waits for the estimate of the observer, or for the controller's torque; none: real time."
@@ -45,8 +45,8 @@ PARAMETERS = (ARM, JOINT_STATES_RATE, *OWN)
 class ReplayNode(Driver):
     """A driver whose device is a recording.
 
-    Its states name no controller: none acts. In real time the samples come on their grid, in lockstep one after each
-    answer, with the same stamps in every run.
+    Its states name no controller, so no controller acts. In real time the samples come on their grid; in lockstep one
+    comes after each answer, with the same stamps in every run.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class ReplayNode(Driver):
         self.notes = made.notes
 
     def make_gate(self):
-        return TorqueGate(self.arm, self.period)  # for the session alone
+        return TorqueGate(self.arm, self.period)  # only for the session
 
     @property
     def lockstep(self):
@@ -94,7 +94,7 @@ class ReplayNode(Driver):
         self.get_logger().info(
             f"arm {self.arm.name}, {len(self.playback)} samples at {rate}, {mode}"
         )
-        # In lockstep the same stamps in every run; in real time those of this machine's clock.
+        # In lockstep the stamps are the same in every run; in real time they are those of this machine's clock.
         first = round(1e9 * max(self.playback.recording.start, 0.0))
         self._origin = first if self.lockstep else self.get_clock().now().nanoseconds
 
@@ -147,7 +147,7 @@ class ReplayNode(Driver):
             self.report(f"the {who} answers nothing: is it running, on this domain, with this arm?")
 
     def _answered(self, message, by):
-        """Whether a message answers the newest sample, of this session; in lockstep the next one follows."""
+        """Play the next sample if, in lockstep, a message answers the newest one of this session."""
         newest = (self.gate.session, self._sample.number)
         if (message.session, message.sequence) == newest and self.parameters["lockstep"] == by:
             self._play()
@@ -170,7 +170,7 @@ class ReplayNode(Driver):
         self._answered(message, CONTROLLER)
 
     def apply(self, torque):
-        """Nothing is applied: the motion has been."""
+        """Nothing is applied: the motion is in the past."""
 
     def make_safe(self):
         """Nothing to do: nothing moves."""

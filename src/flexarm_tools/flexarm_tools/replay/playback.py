@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of a recording one after the other, and what a controller sent for each. No ROS."""
+"""Gives the samples of a recording one after the other, and keeps what a controller sent for each. No ROS."""
 
 import numpy as np
 
@@ -40,7 +40,7 @@ class Playback:
         return self.next >= len(self)
 
     def take(self):
-        """The number of the sample that is due; the next one is due then."""
+        """Return the number of the sample that is due; then the next one is due."""
         self.next += 1
         return self.next - 1
 
@@ -77,7 +77,7 @@ class Playback:
 
 
 def _velocity(recording):
-    """Measured joint speeds, zero of joints that are held; None where one is unknown."""
+    """Measured joint speeds, zero for joints that are held; None if one is unknown."""
     if recording.velocity is None:
         return None
     held = [name in recording.held for name in recording.joint_names]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers of a recorded run: tracking, vibration after motions, torque, losses, spectra. No drawing.
+"""Computes the numbers of a recorded run: tracking, vibration after motions, torque, losses, spectra. No drawing.
 
 Peak error and residual vibration are defined in `flexarm_studies.loop.metrics`.
 """
@@ -27,7 +27,7 @@ SEGMENT, MIN_SEGMENT = 8.0, 1.0
 PADDED = 4
 #: Number of natural frequencies that are shown, from the lowest on.
 MAX_FREQUENCIES = 6
-#: A measured frequency is reported when its power exceeds its neighbourhood's by this factor.
+#: A measured frequency is reported if its power exceeds that of its neighbourhood by this factor.
 OUTSTANDING = 10.0
 
 
@@ -70,7 +70,7 @@ def summary(run, moves=None):
     Returns
     -------
     dict
-        Numbers in SI, lists with one number per joint or link; None for what the bag does not hold.
+        Numbers in SI, lists with one number per joint or link; None for what the bag does not contain.
     """
     moves = motions(run) if moves is None else moves
     found = {
@@ -90,7 +90,7 @@ def summary(run, moves=None):
 
 
 def _lost_by_recorder(run):
-    """Samples of which the bag holds only the answering torque: the recorder missed them, the controller did not."""
+    """Samples of which the bag contains only the answering torque: the recorder missed them, the controller did not."""
     table, base = run.contents.tables.get("joint_torque"), run.contents.tables[run.base]
     if table is None or not run.timeline.lost:
         return 0
@@ -223,13 +223,13 @@ def tip_rows(model):
 
 
 def _parts(run):
-    """Slices that cover all samples, so that no table of all of them has to be in memory."""
+    """Slices that cover all samples, so a table of all samples need not be in memory."""
     size = 200_000
     return [slice(a, a + size) for a in range(0, run.time.size, size)]
 
 
 def torque_column(run, j):
-    """A joint's torque as sent, or as applied where the bag lacks that [N m]; NaN while torque was not enabled."""
+    """A joint's sent torque, or the applied one if the bag lacks that [N m]; NaN while torque was not enabled."""
     mode = run.column("joint_torque", "mode")
     sent = run.column("joint_torque", "torque", j)
     if sent is not None and mode is not None:
@@ -282,7 +282,7 @@ class Spectrum:
 
 
 def spectrum(run, mask):
-    """Welch's estimate over the stretches without gaps in samples, `mask` (k,); None where none is long enough."""
+    """Welch's estimate over the stretches without gaps in the samples of `mask` (k,); None if none is long enough."""
     from scipy.signal import welch
 
     if not run.amplitude_source or not run.period > 0.0:
@@ -304,7 +304,7 @@ def spectrum(run, mask):
         if b - a < length / 2 or b - a < 8:
             continue
         signal = run.deflections(slice(a, b)) @ rows.T
-        # A shorter piece is padded to the same frequencies; its own length is what is averaged over.
+        # A shorter piece is padded to the same frequencies; the average is over its own length.
         f, p = welch(
             signal, rate, nperseg=min(length, b - a), nfft=PADDED * length, detrend="linear", axis=0
         )
@@ -380,7 +380,7 @@ def episodes(run):
 
 
 def refusals(run):
-    """When a reason for a refusal was given: (time [s], state, reason)."""
+    """Times at which a reason for a refusal was given: (time [s], state, reason)."""
     if not run.has("controller/state"):
         return []
     reasons = run.contents.reasons

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The animation's numbers: straight links, their bending, and the reference.
+"""Computes the animation's numbers: straight links, their bending, and the reference.
 
 A point of a link's axis is p_i + R_i (x, sum phi_y delta_y, sum phi_z delta_z), with the link's base frame (R_i, p_i)
-of the bent arm. The page draws straight + factor (bent - straight). A factor of one shows the arm as it is, a larger
-one exaggerates the bending, to first order.
+of the bent arm. The page draws straight + factor (bent - straight). A factor of one shows the arm as it is; a larger
+factor exaggerates the bending, to first order.
 """
 
 import base64
@@ -121,7 +121,7 @@ def window(runs):
 
 
 def film(run, times):
-    """Frames of a run at given times; before and after the run, those of its first and last sample."""
+    """Frames of a run at given times; before and after the run, the frame of its first or last sample."""
     rows = np.clip(np.searchsorted(run.time, times, "right") - 1, 0, run.time.size - 1)
     shape = Shape(run.arm)
     first, last = int(rows.min()), int(rows.max()) + 1
@@ -156,7 +156,7 @@ def possible(run):
 
 
 def data(runs):
-    """The animation of all `runs` for the page's script, ready for JSON; None where no arm is known.
+    """The animation of all `runs` for the page's script, ready for JSON; None if no arm is known.
 
     Numbers are integer multiples of a `unit`, two bytes each, little endian, in base 64; -32768 stands for none.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm report``: recorded runs on one page of HTML."""
+"""``flexarm report``: reads recorded runs and writes them on one page of HTML."""
 
 import json
 import time
@@ -46,7 +46,7 @@ def add_arguments(parser):
 
 
 def report(options):
-    """Run ``report``; the page's path."""
+    """Run ``report``; return the page's path."""
     progress, out = Progress(), _page_file(options.out)
     runs = read(
         options.bags, options.arm, options.namespace, progress, mappings.of_options(options)
@@ -65,7 +65,7 @@ def report(options):
 
 
 def make(bags, out, arm=None, namespace=None, progress=None, names=None, opening=""):
-    """Write the report of some bags; the page's path.
+    """Write the report of some bags; return the page's path.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def make(bags, out, arm=None, namespace=None, progress=None, names=None, opening
         See `bag.read`.
     progress : Progress, optional
     names : sequence of str, optional
-        What the runs are called on the page; by their folders if not given.
+        Names of the runs on the page; if not given, those of their folders.
     opening : str
         Sentences before the numbers: what one sees on the page.
 
@@ -152,13 +152,13 @@ def read(bags, arm=None, namespace=None, progress=None, mapping=None):
 
 
 def labels(paths, namespaces):
-    """Labels of runs: as many last parts of their paths as tell them apart, and the namespace where paths don't."""
+    """Labels of runs: as many last parts of their paths as distinguish them, and the namespace if paths do not."""
     parts = []
     for path in paths:
         path = Path(path).resolve()
         path = path.with_suffix("") if path.suffix in (".mcap", ".db3", ".csv") else path
         pieces = [p for p in path.parts if p != path.anchor] or [str(path)]
-        # The demo's bags are called `bag`, a file in a bag as the bag.
+        # The demo's bags are called `bag`, and a file in a bag has the same name as the bag.
         if len(pieces) > 1 and pieces[-1] == "bag":
             pieces = pieces[:-1]
         parts.append(pieces)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report's figures, as SVG inside the page; a figure that is too large becomes a PNG.
+"""Draws the report's figures as SVG inside the page; a figure that is too large becomes a PNG.
 
-All have the same time axis, and each run has one colour. Series are thinned to the smallest and largest value of each
-bin, so that no peak is lost.
+All figures have the same time axis, and each run has one colour. Series are thinned to the smallest and largest value
+of each bin, so no peak is lost.
 """
 
 import base64
@@ -60,7 +60,7 @@ class Figure:
 
 
 def plain(text):
-    """A name escaped for matplotlib: a dollar starts no formula, and a leading underscore hides nothing."""
+    """A name escaped for matplotlib, so a dollar starts no formula, and a leading underscore hides nothing."""
     text = text.replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
@@ -71,7 +71,7 @@ def colour(i):
 
 
 def draw(runs, moves, spectra, label, png=False):
-    """A list of `Figure`: all for which the runs have data.
+    """Draw all figures for which the runs have data; return a list of `Figure`.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def draw(runs, moves, spectra, label, png=False):
     moves : list of list of Motion
     spectra : list of (Spectrum or None)
     label : str
-        What time zero is, in words.
+        Meaning of time zero, in words.
     png : bool
         Draw all figures as PNG.
     """

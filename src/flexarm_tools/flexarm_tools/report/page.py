@@ -12,9 +12,9 @@ from flexarm_studies.loop import metrics
 from . import analysis, animation, figures, template
 from .run import STATES
 
-#: Largest page: it has to fit into a mail [bytes].
+#: Largest page: it must fit into a mail [bytes].
 MAX_SIZE = 5_000_000
-#: Rows of the table of events.
+#: Max. number of rows of the table of events.
 MAX_EVENTS = 200
 #: More runs than this have no colour of their own.
 MAX_RUNS = len(figures.COLOURS)
@@ -93,7 +93,7 @@ def write(runs, opening=""):
 
 
 def _align(runs, moves):
-    """Put time zero at the first motion, where every run has one. Returns what the time counts from, in words."""
+    """Put time zero at the first motion if every run has one. Returns the meaning of time zero, in words."""
     if all(moves):
         for run, m in zip(runs, moves, strict=True):
             run.start_at(m[0].start)
@@ -196,7 +196,7 @@ def short(runs, numbers):
 
 
 def _window(m):
-    """When residual vibration was judged, in words."""
+    """Time window in which residual vibration was judged, in words."""
     start, end = m["residual_window_s"]
     return f"{start:.3g} to {end:.3g} s after {'the motion' if m['residual_windows'] == 1 else 'each motion'}"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One recorded run: the samples of a bag's topics on one time axis, read column by column."""
+"""Reads one recorded run column by column: the samples of a bag's topics on one time axis."""
 
 from functools import cached_property
 
@@ -11,7 +11,7 @@ from flexarm_dynamics.models import model
 
 from . import timeline
 
-#: `CompositeState`'s numbers, in order.
+#: Names of the numbers in `CompositeState`, in order.
 STATES = ("INACTIVE", "READY", "TRACKING", "HOLDING", "STOPPING", "FAULT")
 INACTIVE, READY, TRACKING, HOLDING, STOPPING, FAULT = range(6)
 ALL = slice(None)
@@ -81,17 +81,17 @@ class Run:
 
     @property
     def joint_names(self):
-        """In the order of the arm file."""
+        """Joint names in the order of the arm file."""
         return self.contents.names["joint_names"]
 
     @property
     def gauge_names(self):
-        """In the order of the arm file."""
+        """Gauge names in the order of the arm file."""
         return self.contents.names["gauge_names"]
 
     @property
     def mode_names(self):
-        """In the order of the arm file."""
+        """Mode names in the order of the arm file."""
         return self.contents.names["mode_names"]
 
     @property
@@ -105,7 +105,7 @@ class Run:
         return self.timeline.period
 
     def has(self, topic, field=None):
-        """Whether the bag has a topic, and in it some number in a field."""
+        """Whether the bag has a topic, and some number in a field of it."""
         table = self.contents.tables.get(topic)
         return table is not None and (field is None or field in table.known)
 
@@ -116,7 +116,7 @@ class Run:
     # Columns -----------------------------------------------------------------------------------
 
     def column(self, topic, field, j=None, part=ALL):
-        """A field's values in each sample, NaN where the topic has none; None without the field.
+        """Values of a field in each sample, NaN where the topic has none; None if there is no such field.
 
         Parameters
         ----------
@@ -169,7 +169,7 @@ class Run:
 
     @cached_property
     def _last_answer(self):
-        """The last sample up to each one that has a `controller/state`, -1 where it is too long ago, shape (k,)."""
+        """For each sample, the last one so far that has a `controller/state`; -1 if it is too long ago; shape (k,)."""
         here = np.arange(self.time.size)
         known = self._rows_of("controller/state") >= 0
         last = np.maximum.accumulate(np.where(known, here, -1))
@@ -192,7 +192,7 @@ class Run:
         return self.column(self.base, "joint_position", j, part)
 
     def reference(self, j, part=ALL):
-        """Reference joint angle where there is one [rad]; None without."""
+        """Reference joint angle [rad]; None if there is no reference."""
         values = self.column("controller/state", "reference_position", j, part)
         if values is None:
             return None
@@ -200,7 +200,7 @@ class Run:
         return np.where((state >= READY) & (state <= STOPPING), values, np.nan)
 
     def error(self, j, part=ALL):
-        """Reference less measurement [rad]; None without a reference."""
+        """Reference minus measurement [rad]; None without a reference."""
         reference = self.reference(j, part)
         return None if reference is None else reference - self.position(j, part)
 
@@ -274,7 +274,7 @@ class Run:
         return self.column(self.base, "joint_position", part=part)
 
     def references(self, part=ALL):
-        """Reference angles, shape (part, n) [rad]; None without."""
+        """Reference angles, shape (part, n) [rad]; None without a reference."""
         if not self.has("controller/state", "reference_position"):
             return None
         return np.column_stack([self.reference(j, part) for j in range(len(self.joint_names))])

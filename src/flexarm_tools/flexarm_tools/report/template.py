@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page's HTML, style and script: all that it needs is in it."""
+"""Contains the page's HTML, style and script; the page needs nothing else."""
 
 # ruff: noqa: E501  (HTML)
 

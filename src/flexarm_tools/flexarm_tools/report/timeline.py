@@ -2,7 +2,7 @@
 """Puts samples in order on one time axis; joins topics; thins series for drawing. Plain arrays.
 
 Session, sequence and stamp identify a sample; every answer to it copies them. The sequence counts samples and so shows
-losses; the stamp is the time. Where the two contradict each other, the clock has jumped, and the sequence is taken as
+losses; the stamp is the time. If the two contradict each other, the clock has jumped, and the sequence is taken as
 correct. A new session follows the one before without a gap.
 """
 
@@ -88,7 +88,7 @@ def arrange(stamp, session, sequence):
     expected = counts * safe
     off = np.abs(steps - expected) > np.maximum(JUMP_SECONDS, JUMP_PERIODS * safe)
     jumped = same & (off | (steps <= 0.0))
-    # Where a silent source went on counting there is a gap, not a jump.
+    # If a silent source went on counting, there is a gap, not a jump.
     jumps = [(int(i) + 1, float(steps[i] - expected[i])) for i in np.flatnonzero(jumped)]
     steps = np.where(same & ~jumped, steps, expected)
     starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
@@ -101,7 +101,7 @@ def arrange(stamp, session, sequence):
 
 
 def _epochs(stamp, session, sequence):
-    """Number of the source's restart that each sample belongs to, by order of arrival, shape (k,)."""
+    """Number of the source's restart to which each sample belongs, by order of arrival, shape (k,)."""
     if not len(stamp):
         return np.zeros(0, int)
     changed = np.diff(session) != 0

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm resonance``: what rings in an arm, and the shaper for it."""
+"""``flexarm resonance``: finds what rings in an arm, and the shaper for it."""

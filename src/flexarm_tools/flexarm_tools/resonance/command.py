@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm resonance``: the modes that ring in a recording, with intervals, and the shaper that takes them out."""
+"""``flexarm resonance``: finds the modes that ring in a recording, with intervals, and the shaper that removes them."""
 
 import json
 import sys
@@ -157,12 +157,12 @@ def _add_motion(add):
 
 
 def resonance(options):
-    """Run ``resonance``; what was found as plain data.
+    """Run ``resonance``; return what was found as plain data.
 
     Raises
     ------
     FlexarmError
-        For what can't be read, where nothing rings, and for options that are no numbers or out of range.
+        If the recording can't be read, if nothing rings, and for options that are not numbers or out of range.
     """
     wishes = wishes_of(options)
     if options.recordings:
@@ -191,7 +191,7 @@ def resonance(options):
 
 
 def _motion(made, options, wishes):
-    """What the motion of ``--trajectory`` or ``--move`` excites; None without one."""
+    """What the motion of ``--trajectory`` or ``--move`` excites; None if there is no motion."""
     if options.trajectory:
         return studies.of_trajectory(made, read_trajectory(options.trajectory))
     return studies.of_trajectory(made, of_move(wishes.move)) if options.move else None
@@ -208,7 +208,7 @@ def by_motion(options, wishes):
     Raises
     ------
     FlexarmError
-        Without ``--allow-motion`` or ``--simulate``, for motions beyond their bounds, and where the measurement was
+        Without ``--allow-motion`` or ``--simulate``, for motions beyond their bounds, and if the measurement was
         stopped.
     """
     bounds = Bounds(**{name: getattr(options, name) for name in BOUNDS})
@@ -256,7 +256,7 @@ def _moved(arm, options, wishes, bounds):
 
 
 def read(path, mapping=None, namespace="", quantities=()):
-    """A `Recording` of a CSV file, or of a bag: of its `arm_state` where there is one, else of joint states and IMUs.
+    """Read a `Recording` from a CSV file or a bag: from `arm_state` if there, otherwise from joint states and IMUs.
 
     Parameters
     ----------
@@ -266,12 +266,12 @@ def read(path, mapping=None, namespace="", quantities=()):
     namespace : str
         Of the topics in a bag.
     quantities : sequence of str
-        That are wanted: those of an IMU are in no `arm_state`.
+        The wanted quantities; an `arm_state` has none of an IMU.
 
     Raises
     ------
     FlexarmError
-        For what can't be read.
+        If it can't be read.
     """
     if Path(path).exists() and recordings.is_bag(path) and mapping is None:
         there = robot.kinds(path)
@@ -282,12 +282,12 @@ def read(path, mapping=None, namespace="", quantities=()):
 
 
 def wishes_of(options):
-    """The `Wishes` that the options say.
+    """The `Wishes` that the options express.
 
     Raises
     ------
     FlexarmError
-        For options that are no numbers or out of range.
+        For options that are not numbers or out of range.
     """
     low, high = _listed("--band", options.band, 2)
     if not 0.0 <= low < high:

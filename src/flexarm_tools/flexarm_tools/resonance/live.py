@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A running arm that is moved through its trajectory topic, to be measured."""
+"""Moves a running arm through its trajectory topic, to measure it."""
 
 import time
 
@@ -10,14 +10,14 @@ from flexarm_studies.resonance.motion import Arm
 
 from ..recording import robot
 
-#: Timeouts: until the first joint state, and for a controller to subscribe [s].
+#: Timeout for the first joint state, and for a controller to subscribe [s].
 PATIENCE = 10.0
-#: The hold that replaces a motion is reached in this time [s].
+#: Time in which the hold that replaces a motion is reached [s].
 HOLD = 0.2
 
 
 class RunningArm(Arm):
-    """An arm behind `joint_trajectory` and `joint_states`, and what else is listened to.
+    """An arm behind `joint_trajectory` and `joint_states`, with the other topics that are read.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class RunningArm(Arm):
     Raises
     ------
     FlexarmError
-        Where no joint state comes, or no controller takes trajectories.
+        If no joint state comes, or no controller takes trajectories.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class RunningArm(Arm):
         return deserialize_message(raw, JointState)
 
     def sample(self, patience):
-        """As of `Arm`; the clock is this machine's. Messages that lack one of the joints are passed over."""
+        """As in `Arm`; the clock is that of this machine. Messages that lack one of the joints are skipped."""
         messages, end = self._joints.messages, time.monotonic() + patience
         while True:
             left = end - time.monotonic()
@@ -91,12 +91,12 @@ class RunningArm(Arm):
             return time.monotonic(), self._position, velocity
 
     def move(self, motion, start):
-        """As of `Arm`."""
+        """As in `Arm`."""
         self.begin = self._stamp
         self._publish(motion.times, np.asarray(start) + motion.positions, motion.velocities)
 
     def stop(self):
-        """As of `Arm`: a hold where it was seen last, which every trajectory controller takes, then a stop."""
+        """As in `Arm`: a hold at the last known position, which every trajectory controller takes, then a stop."""
         if self._position is not None and np.isfinite(self._position).all():
             self._publish(
                 np.array([HOLD]), self._position[None], np.zeros((1, len(self.joint_names)))
@@ -119,12 +119,12 @@ class RunningArm(Arm):
         self._publisher.publish(self._kind(joint_names=list(self.joint_names), points=points))
 
     def streams(self):
-        """As of `Arm`; topics without a message are left out, with a note in `notes`.
+        """As in `Arm`; topics without a message are left out, with a note in `notes`.
 
         Raises
         ------
         FlexarmError
-            For messages of no use.
+            For messages that can't be used.
         """
         self._session.poll()
         found = []

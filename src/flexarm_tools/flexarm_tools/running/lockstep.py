@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs of the three nodes as three processes, in lockstep, recorded."""
+"""Runs the three nodes as three processes in lockstep, and records them."""
 
 import time
 from dataclasses import dataclass
@@ -62,7 +62,7 @@ class Timing:
 
 
 class LockstepRun(Session):
-    """A session with three running nodes: trajectory, start, recording.
+    """A session with three running nodes: it sends a trajectory, starts the run and records it.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class LockstepRun(Session):
         With simulator (``lockstep``), observer and controller started.
     """
 
-    #: Between two looks at the recording [s].
+    #: Time between two checks of the recording [s].
     POLL_PERIOD = 0.005
 
     def __init__(self, processes):
@@ -95,9 +95,9 @@ class LockstepRun(Session):
         return self.controller_state().supervisor_state not in without
 
     def takes_trajectories(self):
-        """Whether the controller sends torque, or names what its first torque waits for.
+        """Whether the controller sends torque, or reports why its first torque waits.
 
-        Right after `~/recover` it does neither: it refuses trajectories until the next state has come.
+        Right after `~/recover` it does neither: it refuses trajectories until the next state comes.
         """
         state = self.controller_state()
         return self.ready() or (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The installed executables as processes, on a DDS domain of their own."""
+"""Runs the installed executables as processes, on a DDS domain of their own."""
 
 import argparse
 import contextlib
@@ -32,14 +32,14 @@ class ProcessError(FlexarmError):
 
 
 def installed(*parts):
-    """Path of an installed file, looked for in every sourced prefix.
+    """Path of an installed file; every sourced prefix is searched.
 
-    The `parts` are of its path below the prefix.
+    The `parts` make up its path below the prefix.
 
     Raises
     ------
     ProcessError
-        When it is not installed.
+        If it is not installed.
     """
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         path = Path(prefix, *parts)
@@ -58,7 +58,7 @@ def executable(package, name):
 def own_domain():
     """A ROS_DOMAIN_ID that no other flexarm run on this machine has, as a context.
 
-    The domain is held by a file lock, so that it is free again however the process ends.
+    A file lock holds the domain, so the domain is free again however the process ends.
     """
     numbers = list(range(1, 101))
     random.Random(os.getpid()).shuffle(numbers)
@@ -82,7 +82,7 @@ def environment(domain):
     env.setdefault("RCUTILS_LOGGING_USE_STDOUT", "0")
     # One thread each: small matrices, and the other processes need the other cores.
     env.update(dict.fromkeys(ONE_THREAD, "1"))
-    env[PARENT] = str(os.getpid())  # nothing is left behind, even by kill -9
+    env[PARENT] = str(os.getpid())  # no process is left behind, even after kill -9
     return env
 
 
@@ -103,7 +103,7 @@ def arguments(parameters=None, file=None, remaps=()):
         words += ["--params-file", str(file)]
     for name, value in (parameters or {}).items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
-        # Quoted, or YAML would read a name such as "1e3" or "none" as something else.
+        # Quoted; otherwise YAML would read a name such as "1e3" or "none" as something else.
         words += ["-p", f'{name}:="{text}"' if isinstance(value, str) else f"{name}:={text}"]
     for remap in remaps:
         words += ["-r", remap]
@@ -111,7 +111,7 @@ def arguments(parameters=None, file=None, remaps=()):
 
 
 def popen(command, log, env):
-    """Start a command in a session of its own; what it prints is appended to the file `log`."""
+    """Start a command in a session of its own; its output is appended to the file `log`."""
     with open(log, "ab") as stream:
         return subprocess.Popen(
             command,
@@ -124,14 +124,14 @@ def popen(command, log, env):
 
 
 class Processes:
-    """Child processes that end with the context, however that ends, and with this process.
+    """Child processes that end with the context manager, however it ends, and with this process.
 
     Parameters
     ----------
     domain : int
         ROS_DOMAIN_ID of all of them.
     log_directory : Path
-        One log file each.
+        Folder of one log file for each.
     """
 
     #: After SIGINT a process has this long before it is killed [s].
@@ -146,7 +146,8 @@ class Processes:
     def start(self, name, command, by=popen):
         """Start a command; its output goes to ``<log_directory>/<name>.log``.
 
-        ``by(command, log=, env=)`` is what starts it: `popen`, or another that gives as much of a `subprocess.Popen`.
+        ``by(command, log=, env=)`` starts it: `popen`, or another function that returns the same parts of a
+        `subprocess.Popen`.
         """
         self._ending.discard(name)
         log = self.logs / f"{name}.log"
@@ -173,7 +174,7 @@ class Processes:
         return "\n".join(f"--- {path.stem}\n{_tail(path, 8)}" for path in logs)
 
     def expect_end(self, name):
-        """From now on `check` accepts that this process ends; return the process."""
+        """Let `check` accept from now on that this process ends; return the process."""
         self._ending.add(name)
         return self.running[name]
 
@@ -185,7 +186,7 @@ class Processes:
                 raise ProcessError(f"ended with code {process.returncode}:\n{tail}", field=name)
 
     def stop(self, number=signal.SIGINT):
-        """Signal all, wait, and kill what does not end; exit codes by name."""
+        """Signal all, wait, and kill those that do not end; return exit codes by name."""
         for process in self.running.values():
             if process.poll() is None:
                 process.send_signal(number)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bare relay of the control path's messages through three processes: what the middleware alone costs.
+"""Relays the control path's messages through three processes, without control: the cost of the middleware alone.
 
-Each of three plain nodes answers the message it gets with a ready-made one of the same type and size, and
-sends the same side messages; nothing is computed. ``python -m flexarm_tools.running.relay ROLE ARM [COUNT|SPIN]``: of a
-source the round trips, of the others how they are served: ``executor``, by rclpy's, or ``line``, as the nodes are.
+Each of three plain nodes answers the message that it gets with a ready-made one of the same type and size, and sends
+the same side messages. Nothing is computed. ``python -m flexarm_tools.running.relay ROLE ARM [COUNT|SPIN]``: for a
+source, COUNT is the number of round trips. For the others, SPIN is how they are served: ``executor``, by rclpy's
+executor, or ``line``, like the real nodes.
 """
 
 import statistics
@@ -51,7 +52,7 @@ def _answer(incoming, outgoing):
 def _relay(name, taken, answer, topic, beside, beside_topic):
     """A node that answers each state on the topic `taken` with two ready-made messages.
 
-    The message `beside` is sent only if its topic has subscribers, as the nodes do it.
+    The message `beside` is sent only if its topic has subscribers, as in the real nodes.
     """
     node = Node(f"relay_{name}")
     answers = node.create_publisher(type(answer), topic, qos.CONTROL_PATH)
@@ -99,12 +100,12 @@ class Source(Node):
         self.create_timer(0.1, self.resend)
 
     def resend(self):
-        """Until the others are there."""
+        """Send again until the others are there."""
         if not self.times:
             self.pub.publish(self.state)
 
     def relay(self, msg):
-        """Next message."""
+        """Send the next message."""
         if msg.sequence != self.state.sequence:
             return
         self.times.append(time.perf_counter())
@@ -148,7 +149,7 @@ def measure(arm, log_directory, count=3000, recorder=None):
     count : int
         Round trips.
     recorder : callable, optional
-        ``recorder(processes)``, a context manager with `poll`: what else listens, as in the run compared.
+        ``recorder(processes)``, a context manager with `poll`: another reader, as in the run that is compared.
     """
     with own_domain() as domain, Processes(domain, log_directory) as processes:
         for role in ("observer", "controller"):

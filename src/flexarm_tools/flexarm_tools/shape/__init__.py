@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of a running arm: `drawing` has the maths, `node` publishes it for RViz, `flexarm view` shows it."""
+"""Draws a running arm: `drawing` has the mathematics, `node` publishes it for RViz, `flexarm view` shows it."""
 
 from flexarm_ros.start import start
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All modal amplitudes of an arm, from states that hold the observed ones."""
+"""Gives all modal amplitudes of an arm, from states that contain the observed ones."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from flexarm_ros.messages import StateReader
 
 
 class Amplitudes:
-    """All modal amplitudes of an `arm`, from states that hold the observed ones."""
+    """All modal amplitudes of an `arm`, from states that contain the observed ones."""
 
     def __init__(self, arm):
         self.reader = StateReader(arm)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of an arm: lines along its links, the path of its tip, arrows for its torques. No ROS."""
+"""Computes a picture of an arm: lines along its links, the path of its tip, arrows for its torques. No ROS."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 
 from flexarm_dynamics.arm.sections import Sections
 
-#: Length of the arrow of a joint's whole torque limit, of the arm's [-].
+#: Length of the arrow of a joint's whole torque limit, relative to the arm's length [-].
 ARROW = 0.6
 
 
@@ -19,15 +19,15 @@ class Picture:
     Attributes
     ----------
     beam : (k, 3) ndarray
-        Along the axes of all links, as they are bent.
+        Points along the axes of all links, as they are bent.
     ghost : (l, 3) ndarray
-        The same joints and straight links.
+        Points with the same joint angles and straight links.
     joints : (n, 3) ndarray
-        Where the joints are.
+        Positions of the joints.
     tip : (3,) ndarray
     slow, fast : (n, 2, 3) ndarray
-        Arrows of the torques along the joints' axes, from and to: the slow one's from its joint, the fast one's from
-        where that ends, so that both end at the sum.
+        Arrows of the torques along the joints' axes, from and to. The slow arrow starts at the joint, and the fast
+        arrow starts where the slow one ends. So together they end at the sum.
     """
 
     beam: np.ndarray
@@ -45,7 +45,7 @@ class Drawer:
     ----------
     model : ArmModel
     count : int
-        Straight parts of each flexible link.
+        Number of straight parts of each flexible link.
     """
 
     def __init__(self, model, count=12):
@@ -55,7 +55,7 @@ class Drawer:
         self._linear = None
         self._axes = np.array([joint.axis for joint in self.arm.joints])
         limits = self.arm.torque_limits
-        # Where the arm file names no limit, the largest torque so far.
+        # If the arm file has no limit, the largest torque so far.
         self._open = ~np.isfinite(limits)
         self._full = np.where(self._open, 1e-9, limits)
         self._rest = np.zeros(len(self.arm.modes))
@@ -81,7 +81,7 @@ class Drawer:
         delta = self._rest if delta is None else np.asarray(delta, float)
         frames = self._of(exaggeration).frames(q, exaggeration * delta)
         joints = np.array([p[0] for _, p in frames])
-        # A joint's own turn leaves its axis where it is.
+        # A joint's own rotation does not move its axis.
         axes = np.array([R[0] @ axis for (R, _), axis in zip(frames, self._axes, strict=True)])
         one, other = self._lengths(slow, fast)
         middle = joints + one[:, None] * axes
@@ -95,7 +95,7 @@ class Drawer:
         )
 
     def plan(self, points):
-        """The straight arm at the last of some joint positions (k, n) [rad], and the tip's way along them.
+        """The straight arm at the last of some joint positions (k, n) [rad], and the tip's path along them.
 
         Both are points, (., 3) [m].
         """

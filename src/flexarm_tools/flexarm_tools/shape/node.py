@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shape node: `arm_state_estimate` and `controller/state` in, `shape` and `shape/joint_states` out.
+"""Shape node: receives `arm_state_estimate` and `controller/state`, publishes `shape` and `shape/joint_states`.
 
-Markers for RViz and Foxglove, and the joints of the URDF that ``flexarm urdf`` writes, at a rate for the eye.
+These are markers for RViz and Foxglove, and the joints of the URDF that ``flexarm urdf`` writes, at a rate for the eye.
 """
 
 import numpy as np
@@ -30,20 +30,20 @@ PARAMETERS = (
         "Pictures per second."
     ),
     parameter("exaggeration", 1.0, "-", 0.0, 1000.0).described(
-        "Deflections are drawn so many times as large; shape/joint_states has them as they are."
+        "Factor by which deflections are drawn larger; shape/joint_states has them as they are."
     ),
     parameter("pieces", 8, "-", 1, 100, read_only=True).described(
         "Rigid pieces of each flexible link in the URDF, as in flexarm urdf --pieces."
     ),
     parameter("trail", 300, "-", 1, 10000, read_only=True).described(
-        "Points of the tip's way that are kept."
+        "Number of points of the tip's path that are kept."
     ),
     parameter(
         "state_topic",
         "arm_state_estimate",
         choices=("arm_state_estimate", "arm_state"),
         read_only=True,
-    ).described("Where the states come from; arm_state: as they are measured."),
+    ).described("Topic of the states; arm_state: as they are measured."),
 )
 #: Red, green, blue, opacity.
 COLOURS = {
@@ -55,7 +55,7 @@ COLOURS = {
     "slow_torque": (1.0, 0.5, 0.05, 1.0),
     "fast_torque": (0.17, 0.63, 0.17, 1.0),
 }
-#: Those whose shown arrows are shorter are not drawn, of the arm's length [-].
+#: Shorter arrows are not drawn; relative to the arm's length [-].
 SHORTEST = 1e-3
 
 
@@ -98,7 +98,7 @@ class Markers:
         return marker
 
     def fill(self, picture, trail, header):
-        """Write a picture and the tip's way (k, 3) into the message; return it."""
+        """Write a picture and the tip's path (k, 3) into the message; return it."""
         for marker in self.message.markers:
             marker.header = header
         for name, points in (("ghost", picture.ghost), ("beam", picture.beam), ("trail", trail)):
@@ -121,7 +121,7 @@ def _points(array):
 
 
 class ShapeNode(ArmNode):
-    """Looks on at the loop and draws it."""
+    """Watches the loop and draws it."""
 
     def __init__(self):
         super().__init__("shape", {"": PARAMETERS})
@@ -168,7 +168,7 @@ class ShapeNode(ArmNode):
         self._pictures += 1
 
     def _torques(self, control):
-        """Slow and fast torque; none where the message is of another arm."""
+        """Slow and fast torque; none if the message is of another arm."""
         if list(control.joint_names) != list(self.arm.joint_names):
             self.report(f"torques not drawn: controller/state is of {control.joint_names}")
             return None, None

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm view``: an arm in the browser. `link` speaks with the nodes, `page` is the page, `command` joins them."""
+"""``flexarm view``: shows an arm in the browser; `link` serves the nodes, `page` is the page, `command` joins them."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``flexarm view``: an arm in the browser, live, of nodes that it starts or that run."""
+"""``flexarm view``: shows an arm live in the browser, from nodes that it starts or that run."""
 
 import contextlib
 import os
@@ -18,17 +18,17 @@ from .pair import Pair
 
 #: Default and largest number of pictures per second.
 RATE, MAX_RATE = 30.0, 100.0
-#: Points of the tip's path.
+#: Number of points of the tip's path.
 TRAIL = 300
-#: Niceness of the page's process: the nodes go first.
+#: Niceness of the page's process: the nodes have priority.
 NICENESS = 10
-#: How far the first target is from where the arm is [rad].
+#: Distance of the first target from the arm's position [rad].
 STEP = 1.0
-#: Where Foxglove looks by itself.
+#: Port that Foxglove opens by default.
 FOXGLOVE = 8765
-#: Joint positions of a planned motion between two points.
+#: Number of joint positions of a planned motion between two points.
 PIECES = 24
-#: After this long without a state the page says so [s].
+#: Time without a state after which the page reports this [s].
 SILENCE = 2.0
 
 
@@ -84,7 +84,7 @@ def view(options):
     Raises
     ------
     FlexarmError
-        When there is no such arm or controller file, or a node that was started ends.
+        If there is no such arm or controller file, or if a started node ends.
     """
     check(options)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -92,7 +92,7 @@ def view(options):
         domain, processes = None, None
         if not options.attach:
             domain, processes = start(options, stack)
-        step_back(NICENESS)  # after the nodes, which would inherit it
+        step_back(NICENESS)  # after the start of the nodes, which would inherit it
         from .link import Link
 
         link = Link(options.namespace, domain, processes)
@@ -102,7 +102,7 @@ def view(options):
 
 
 def check(options):
-    """Refuse options that don't go together, and find the files of those that do."""
+    """Refuse options that are incompatible, and find the files of the others."""
     if not 0.1 <= options.rate <= MAX_RATE:
         raise ParameterError(
             "is out of range",
@@ -124,12 +124,12 @@ def check(options):
 
 
 def files(controller, arm):
-    """Controller file and arm of the nodes to start, where one or both are not given; no file: a design is made.
+    """Controller file and arm of the nodes to start, if one or both are not given; no file: a design is made.
 
     Raises
     ------
     ParameterError
-        When there is no such controller file.
+        If there is no such controller file.
     """
     if controller is None:
         arm = arm or "two_link"
@@ -205,7 +205,7 @@ class View:
             webbrowser.open(page.url)
 
     def _serve_foxglove(self, arm):
-        """The server of the topics; None where foxglove-sdk is not installed."""
+        """The server of the topics; None if foxglove-sdk is not installed."""
         from ..recording.types import typestore
         from .foxglove import Foxglove
 
@@ -251,7 +251,7 @@ class View:
         if self.home is None:
             self.home = snapshot.q
             page.aim(first_target(self.drawer.arm, snapshot.q))
-            # Not before: a controller that is still designing has other laws until then.
+            # Not earlier: a controller that is still designing has other laws until then.
             self.link.find_gains(page.offer_gains)
         picture = self.drawer.picture(
             snapshot.q, snapshot.delta, snapshot.slow, snapshot.fast, page.exaggeration
@@ -270,7 +270,7 @@ class View:
             )
 
     def _show_plan(self, snapshot):
-        """A motion that was published, while it lasts; else the one that the sliders ask for."""
+        """Show a motion that was published, while it lasts; otherwise the motion to the sliders' target."""
         points = self.link.take_planned()
         if points is not None and len(points):
             self._aimed = self.page.target()
@@ -304,14 +304,14 @@ class View:
 
 
 def between(start, points):
-    """Joint positions on the way from a start (n,) through points (k, n), straight in joint angles, (., n) [rad]."""
+    """Joint positions on the path from a start (n,) through points (k, n), straight in joint angles, (., n) [rad]."""
     rows = np.vstack([start, points])
     knots = np.linspace(0.0, len(rows) - 1.0, min(PIECES * (len(rows) - 1), 200) + 1)
     return np.array([np.interp(knots, np.arange(len(rows)), column) for column in rows.T]).T
 
 
 def first_target(arm, q):
-    """Where the page proposes to move: every joint of an arm without weight, the first one of others."""
+    """Target that the page proposes at first: it moves every joint of an arm without weight, one joint of others."""
     heavy = np.linalg.norm(arm.gravity) > 0.0
     step = np.zeros(len(q))
     step[: 1 if heavy else None] = STEP

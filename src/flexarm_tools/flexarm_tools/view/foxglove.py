@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics for Foxglove, without a bridge of a ROS installation: a server of foxglove-sdk in the view's process.
+"""Serves the topics to Foxglove without a bridge of a ROS installation: a server of foxglove-sdk in the view's process.
 
-Messages go on as they came, serialised. Of each topic the newest is sent at the view's rate, so that no publisher waits
-for Foxglove. The arm's shape is drawn here, since a URDF does not bend.
+Messages are passed on as they came, serialised. The newest message of each topic is sent at the view's rate, so no
+publisher waits for Foxglove. The arm's shape is drawn here, because a URDF does not bend.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..recording.recorder import raw_stamp_ns
 
-#: Topic to its type. They are those of the layout ``layouts/foxglove.json``.
+#: Topic to its type. These are the topics of the layout ``layouts/foxglove.json``.
 TOPICS = {
     "arm_state": "flexarm_msgs/msg/ArmState",
     "arm_state_estimate": "flexarm_msgs/msg/ArmState",
@@ -23,7 +23,7 @@ TOPICS = {
 }
 #: Topic and frame of the drawing.
 SHAPE, FRAME = "/shape", "base_link"
-#: Of the bent arm, the straight one, and the tip's path: red, green, blue, opacity; thickness over the arm's reach.
+#: For the bent arm, the straight arm and the tip's path: red, green, blue, opacity; thickness over the arm's reach.
 LINES = {
     "beam": ((0.11, 0.49, 0.84, 1.0), 0.018),
     "ghost": ((0.68, 0.71, 0.74, 1.0), 0.006),
@@ -50,16 +50,16 @@ class Foxglove:
     port : int
         On 127.0.0.1; 0: a free one.
     sources : callable
-        Gives the sequence of `Source`; called once a client is interested.
+        Gives the sequence of `Source`; called when a client is interested.
     definition : callable
-        Type to its definition, with those of the types in it, as text.
+        Type to its definition as text, with the definitions of the types in it.
     reach : float
-        Of the arm, for the thickness of lines [m].
+        Reach of the arm, for the thickness of lines [m].
 
     Attributes
     ----------
     url : str
-        What to open in a browser.
+        Address to open in a browser.
     port : int
     """
 
@@ -88,7 +88,7 @@ class Foxglove:
         self._shape = SceneUpdateChannel(SHAPE, context=self._context)
 
     def forward(self):
-        """Send what has arrived since the last call; how many messages that was.
+        """Send what has arrived since the last call; return the number of messages.
 
         Nothing is read before a client is interested: each reader of a topic costs its publisher a little.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sliders for a controller's gains: which parameters have one, and its range. No ROS."""
+"""Chooses the sliders for a controller's gains: which parameters have one, and its range. No ROS."""
 
 import re
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 LAWS = {"slow.": "flexarm.slow_laws", "fast.": "flexarm.fast_laws"}
 #: A slider ends at this multiple of the starting value, within the declared range.
 SPAN = 4.0
-#: Its end where the starting value is zero.
+#: End of a slider whose starting value is zero.
 FROM_ZERO = 1.0
 STEPS = 400
 
@@ -24,11 +24,11 @@ class Gain:
     index : int or None
         Which element of an array; None: the parameter is one number.
     value, low, high, step : float
-        Of the slider, in the parameter's unit.
+        Values of the slider, in the parameter's unit.
     hint : str
-        What it does.
+        What the gain does.
     owner : str
-        Joint or mode that it belongs to; empty: its number is shown.
+        Joint or mode to which it belongs; empty: its number is shown.
     unit : str
         Empty: none.
     """
@@ -45,7 +45,7 @@ class Gain:
 
     @property
     def label(self):
-        """As it is shown, such as ``slow.kp elbow [1/s^2]``."""
+        """Its text on the page, such as ``slow.kp elbow [1/s^2]``."""
         which = "" if self.index is None else f" {self.owner}" if self.owner else f"[{self.index}]"
         return f"{self.name}{which}" + (f" [{self.unit}]" if self.unit else "")
 
@@ -56,13 +56,14 @@ def of_parameters(values, ranges, hints, laws=None, owners=None):
     Parameters
     ----------
     values : mapping of str to object
-        Parameters with their values; of these, floats and arrays of floats with a range.
+        Parameters with their values; floats and arrays of floats that have a range get sliders.
     ranges : mapping of str to (low, high)
     hints : mapping of str to str
     laws : mapping of str to set of str, optional
-        Prefix to the names that the law in use declares; others are left out. All of a prefix that is not in it stay.
+        Prefix to the names that the active law declares; other names are left out. Names with a prefix that is not in
+        it stay.
     owners : mapping of str to sequence of str, optional
-        Parameter to the joints or modes that its numbers belong to.
+        Parameter to the joints or modes to which its numbers belong.
 
     Returns
     -------
@@ -95,7 +96,7 @@ def unit_of(description):
 
 
 def owners_of(constraints, arm):
-    """Joints or modes that the numbers of an array belong to, from a descriptor's text, as ``length joints``."""
+    """Joints or modes to which the numbers of an array belong, from a descriptor's text such as ``length joints``."""
     found = re.search(r"length (\w+)", constraints)
     names = {"joints": arm.joint_names, "modes": arm.mode_names}
     return tuple(names.get(found[1], ())) if found else ()
@@ -108,7 +109,7 @@ def span(value, low, high):
 
 
 def range_of(constraints):
-    """(low, high) of a descriptor's text, as ``from 0.0 to 100.0; length joints``; None without one."""
+    """(low, high) of a descriptor's text such as ``from 0.0 to 100.0; length joints``; None without one."""
     found = re.search(r"from (\S+) to ([^\s;]+)", constraints)
     return (float(found[1]), float(found[2])) if found else None
 

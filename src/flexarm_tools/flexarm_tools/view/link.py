@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live view's connection to the nodes, in one thread, without a callback per sample."""
+"""Connects the live view to the nodes, in one thread, without a callback per sample."""
 
 import time
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Snapshot:
 
 
 class Link:
-    """Reads the loop's topics, and publishes and asks for the page.
+    """Reads the loop's topics, and publishes and calls services for the page.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Link:
     """
 
     def __init__(self, namespace="", domain=None, processes=None, say=lambda text, bad: None):
-        # Woken by what arrives: there is nothing else to look at.
+        # Woken by what arrives: nothing else has to be checked.
         self.session = Session(
             "view", namespace=namespace, domain=domain, processes=processes, period=1.0
         )
@@ -93,12 +93,12 @@ class Link:
         self._sample = ArmSample(len(arm.joints), len(arm.modes))
 
     def take(self):
-        """The newest state and what the controller made of one; None without a new state.
+        """The newest state, and what the controller computed from one; None without a new state.
 
         Raises
         ------
         MessageError
-            When they are of another arm.
+            If they are of another arm.
         """
         control, msg = self._controls.take(), self._states.take()
         if control is not None:
@@ -130,7 +130,8 @@ class Link:
     def take_planned(self):
         """Joint positions of the newest trajectory on the topic, (k, n) in the arm's order [rad].
 
-        None without a new one. What does not name the arm's joints is the controller's to refuse, and none here.
+        None without a new one. A trajectory without the arm's joint names gives None, too; the controller will refuse
+        it.
         """
         message = self._planned.take()
         names = list(self._arm.joint_names)
@@ -152,7 +153,7 @@ class Link:
         return found
 
     def serve(self, seconds):
-        """Serve services and slow topics for so long; send what has been turned."""
+        """Serve services and slow topics for `seconds`; send gains that were changed."""
         self.session.serve(seconds)
         if self._turned and not self._setting and time.monotonic() > self._turned_at + REST:
             self._send_turned()
@@ -169,7 +170,7 @@ class Link:
     # Commands --------------------------------------------------------------------------------
 
     def move(self, target, duration):
-        """Publish a motion from where the reference is to joint angles [rad] in so many seconds."""
+        """Publish a motion from the present reference to the joint angles `target` [rad] in `duration` [s]."""
         message = JointTrajectory(joint_names=list(self._arm.joint_names))
         zero = [0.0] * len(target)
         point = JointTrajectoryPoint(
@@ -196,7 +197,7 @@ class Link:
         self._ask(SetBool, "enable_fast", self._say_answer, data=bool(on))
 
     def turn(self, name, index, value):
-        """A gain was turned to a value; sent when it rests."""
+        """Note that a gain was turned to a value; the value is sent when the slider rests."""
         self._turned[name, index] = value
         self._turned_at = time.monotonic()
 
@@ -238,7 +239,7 @@ class Link:
         )
 
     def find_gains(self, then):
-        """Ask the controller what can be turned; ``then(list of Gain)``."""
+        """Ask the controller which gains can be changed; ``then(list of Gain)``."""
 
         def listed(answer):
             names = sorted(answer.result.names)
@@ -288,7 +289,7 @@ def show(value):
 
 
 def laws_in_use(values):
-    """Names of the parameters that the laws in use declare, by prefix; nothing of one that is not installed here."""
+    """Names of the parameters that the active laws declare, by prefix; without laws that are not installed here."""
     out = {}
     for prefix, group in gains.LAWS.items():
         try:

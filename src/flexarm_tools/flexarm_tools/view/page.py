@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page: a scene, plots, gains and buttons, by viser. No ROS: what the user does goes into a queue."""
+"""Shows the page with viser: a scene, plots, gains and buttons. No ROS: what the user does goes into a queue."""
 
 import html
 import queue
@@ -21,23 +21,23 @@ BEAM, GHOST, TRAIL, TIP = (28, 126, 214), (173, 181, 189), (224, 49, 49), (224, 
 SLOW, FAST, HUB, PLAN = (247, 103, 7), (47, 158, 68), (52, 58, 64), (250, 176, 5)
 #: Span of the plots [s], and how often they are drawn [Hz].
 WINDOW, PLOT_RATE = 10.0, 6.0
-#: A plot shows at least this much, whatever is in it [mm; mm, mrad; N m]: zero is a line, not an axis from 0 to 100.
+#: A plot's axis has at least this length [mm; mm, mrad; N m]: zero is a line, not an axis from 0 to 100.
 LEAST = {"tip": 0.2, "modes": 0.2, "torques": 0.2, "pair": 0.2}
-#: Number of messages that are shown.
+#: Number of messages shown.
 MESSAGES = 3
 #: Largest factor of the deflections.
 EXAGGERATION = 20.0
 
 
 class History:
-    """The last seconds of some numbers, in so many `columns`."""
+    """The last seconds of some numbers, in `columns` columns."""
 
     def __init__(self, columns):
         self._rows = deque()
         self._columns, self._session = columns, None
 
     def add(self, time, values, session=0):
-        """Add a row; what is older than `WINDOW`, or of another session, is dropped."""
+        """Add a row; rows older than `WINDOW`, or of another session, are dropped."""
         if session != self._session or (self._rows and time < self._rows[-1][0]):
             self._rows.clear()
             self._session = session
@@ -63,7 +63,7 @@ class Page:
     reach : float
         Length of the arm [m].
     port : int
-        On 127.0.0.1; another one where it is taken.
+        On 127.0.0.1; another one if it is taken.
     link : str
         Address that opens the topics in Foxglove; empty: none.
 
@@ -146,7 +146,7 @@ class Page:
         )
 
     def draw_plan(self, lines):
-        """Draw what is planned: the straight arm where the motion ends and the tip's way there, each (k, 3) [m]."""
+        """Draw the plan: the straight arm where the motion ends, and the tip's path to it, each (k, 3) [m]."""
         pieces = [segments(points) for points in lines if len(points) > 1]
         self._plan.visible = bool(pieces)
         if pieces:
@@ -158,7 +158,7 @@ class Page:
         self._trail.visible = self.trail_shown and len(trail) > 1
         if self._trail.visible:
             self._trail.points = segments(trail)
-        # Points like the lines, so that a browser that is late draws both of the same instant.
+        # Points like the lines, so a slow browser draws both of the same instant.
         self._joints.points = picture.joints.astype(np.float32)
         self._tip.points = picture.tip[None].astype(np.float32)
         for handle, arrows in ((self._slow, picture.slow), (self._fast, picture.fast)):
@@ -236,7 +236,7 @@ class Page:
         button.on_click(lambda _: self.done.put(action()))
 
     def _by_hand(self, action):
-        """A callback of a person's changes, not of the page's own."""
+        """A callback for changes by the user, not for those by the page itself."""
 
         def updated(event):
             if event.client is not None:
@@ -279,7 +279,7 @@ class Page:
     # What is shown ---------------------------------------------------------------------------
 
     def target(self):
-        """Where the sliders say that the joints go [rad]."""
+        """Joint angles that the sliders give as target [rad]."""
         return [float(slider.value) for slider in self._targets]
 
     def aim(self, q):
@@ -288,7 +288,7 @@ class Page:
             slider.value = float(np.clip(round(value, 2), slider.min, slider.max))
 
     def say(self, text, bad):
-        """Show a message to the person, above the last ones."""
+        """Show a message to the user, above the last ones."""
         self._messages.appendleft((text, bad))
         lines = "".join(
             f'<div style="color:{"#c92a2a" if bad else "#495057"};opacity:{1.0 - 0.3 * i}">{html.escape(text)}</div>'
@@ -321,7 +321,7 @@ class Page:
             put(self._numbers, numbers(self.arm, snapshot, tip_error))
 
     def plot(self, now):
-        """Draw the plots, if it is time to; `now` in seconds of any steady clock."""
+        """Draw the plots if they are due; `now` in seconds of any steady clock."""
         if now < self._plotted + 1.0 / PLOT_RATE:
             return
         self._plotted = now
@@ -347,7 +347,7 @@ class Page:
             self._pair = (plot,)
 
     def silence(self, seconds):
-        """Show that nothing has been received for so many seconds."""
+        """Show that nothing has been received for this number of seconds."""
         text = (
             f"nothing received for {seconds:.0f} s" if seconds >= 2.0 else "waiting for the nodes"
         )
@@ -374,7 +374,7 @@ class Page:
         return self._by_hand(lambda: ("turn", gain.name, gain.index, float(slider.value)))
 
     def take_values(self, values):
-        """Parameters have these values now, set here or by another program."""
+        """Show the present values of parameters, set here or by another program."""
         for name, value in values.items():
             for i, number in enumerate(value if isinstance(value, list) else [value]):
                 slider = self._gains.get((name, i if isinstance(value, list) else None))
@@ -389,7 +389,7 @@ class Page:
 
 
 def put(handle, content):
-    """Change an element if it says something else."""
+    """Change an element if its content differs."""
     if handle.content != content:
         handle.content = content
 
@@ -404,7 +404,7 @@ def span(columns, least, now=None):
     least : float
         The axis is at least this long.
     now : (low, high), optional
-        Ends that are kept while what is drawn fits, and takes more than a third of them.
+        Ends that are kept while what is drawn fits, and covers more than a third of their distance.
 
     Returns
     -------
@@ -458,7 +458,7 @@ def header(state, reason, other=""):
 
 
 def numbers(arm, snapshot, tip_error):
-    """What the state says in numbers, as HTML."""
+    """The state in numbers, as HTML."""
     rows = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{q:.3f}</td><td>{1e3 * (r - q):.2f}</td>"
         f"<td>{s:.2f}</td><td>{f:.2f}</td></tr>"

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One motion twice, with the fast control and without it: what a person asks of the page, step by step. No ROS."""
+"""Makes one motion twice for the page, step by step: with the fast control and without it. No ROS."""
 
 import numpy as np
 
-#: After a motion's end the tip is watched for so long, and before the next motion so long passes at least [s].
+#: Time for which the tip is watched after a motion's end, and minimum time before the next motion [s].
 WATCHED, PAUSE = 4.0, 1.0
-#: A motion that has not ended so long after it should have is given up [s].
+#: A motion that has not ended by this time after its planned end is given up [s].
 PATIENCE = 10.0
 WITH, WITHOUT = "with fast control", "without"
 
 
 class Pair:
-    """Moves to a target and back with the fast control, then without it, and keeps the tip's error of both ways there.
+    """Moves to a target and back with the fast control, then without it, and keeps the tip's errors of both motions.
 
     Parameters
     ----------
@@ -20,12 +20,12 @@ class Pair:
     home, target : (n,) array_like
         Joint angles [rad].
     duration : float
-        Of each motion [s].
+        Duration of each motion [s].
 
     Attributes
     ----------
     curves : dict
-        `WITH` and `WITHOUT`: time since the motion began [s] and the tip's error [m], two arrays, once they are there.
+        `WITH` and `WITHOUT`: time since the motion began [s] and the tip's error [m], two arrays, when they are known.
     ended : str
         How it ended; empty while it goes on.
     """
@@ -44,7 +44,7 @@ class Pair:
         self.curves, self.ended = {}, ""
 
     def turn(self, snapshot, error):
-        """Look at a state, and do what comes next.
+        """Evaluate a state, and do the next step.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class Pair:
             self._end(self._result())
 
     def _result(self):
-        """Both, in words: how far the tip still swings in the last second that was watched, from crest to trough."""
+        """Result of both, in words: the tip's swing from crest to trough in the last second that was watched."""
         swings = []
         for name in (WITH, WITHOUT):
             time, error = self.curves[name]

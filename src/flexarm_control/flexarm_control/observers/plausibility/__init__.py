@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the readings of an arm can be true together: one check per file, `monitor` runs them."""
+"""Checks whether the readings of an arm can be true together; one check per file, which `monitor` runs."""

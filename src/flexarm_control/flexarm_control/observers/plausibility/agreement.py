@@ -8,16 +8,17 @@ Over a window that began at sample 0, with the trapezoidal rule,
     |x - x_0 - D| \le s\max(|x - x_0|, |D|) + \tau|v - v_0| + 6\sqrt2\,\sigma + c + 2J|v|
     + \sum_k\left(\tfrac12|v_k - v_{k-1}|\,h_k + \tfrac14 G|\Delta u_k|\,h_k^2\right) + 6\sigma_v\sqrt{t\,h}
 
-with :math:`\sigma`, c, J and :math:`G|\Delta u|` as in `jumps`, and :math:`\tau` by which a filtered rate may be late.
-The sum is what the rule can miss: also that a step of the torque moves a light joint and its links to and fro between
-two samples, which begin and end such a swing in the same phase when a mode is as fast as the sampling. Windows of
-`WINDOWS` samples run at the same time; `PERSISTENT` samples in a row beyond the bound are evidence: a sign is wrong, a
-scale by more than s, one of the two stands still, or the value drifts.
-s is 10 %, and 35 % for an arm with a mode that turns by more than a radian in a sample: the rule misses its swings,
-but a factor of two is found. Where a mode turns by more than `ALIASED`, the next one, which the model may not have, can
-be near the sampling frequency. A light joint swings with it, is in the same phase in many samples in a row, and its
-velocity then differs from what the position does on average. There s counts from `LONG` samples of a window on; before
-it is 1, which finds a wrong sign alone.
+with :math:`\sigma`, c, J and :math:`G|\Delta u|` as in `jumps`; :math:`\tau` is how late a filtered rate may be.
+The sum is what the rule can miss. This includes a step of the torque that moves a light joint and its links to and fro
+between two samples: if a mode is as fast as the sampling, such a swing begins and ends in the same phase. Windows of
+`WINDOWS` samples run at the same time. `PERSISTENT` samples in a row beyond the bound are evidence that a sign is
+wrong, a scale is wrong by more than s, one of the two stands still, or the value drifts.
+
+s is 10 %, and 35 % for an arm with a mode whose phase turns by more than a radian in a sample: the rule misses its
+swings, but still finds a factor of two. If a mode turns by more than `ALIASED`, the next one, which the model may not
+have, can be near the sampling frequency. A light joint that swings with it is in the same phase in many samples in a
+row, and its velocity then differs from the mean motion of its position. In this case s counts only from `LONG` samples
+of a window on; before, it is 1, which finds only a wrong sign.
 """
 
 import numpy as np
@@ -25,19 +26,19 @@ import numpy as np
 from ... import kernels
 from ...kernels import readings
 
-#: Lengths of the windows in samples; the short one is quick, the long one sees slow motion and coarse encoders.
+#: Lengths of the windows in samples; the short one is quick, the long one is for slow motion and coarse encoders.
 WINDOWS = (20, 200)
 #: Samples in a row beyond the bound.
 PERSISTENT = 4
 #: Ratio by which a rate may be wrong [-].
 SCALE = 0.1
-#: The same, and the factor of what the trapezoidal rule can miss, where modes are fast for the sampling [-].
+#: The same, and the factor of what the trapezoidal rule can miss, for modes that are fast for the sampling [-].
 FAST_SCALE, FAST_MISSED = 0.35, 2.0
-#: Angle by which a mode turns in a sample from which on its successor may be aliased [rad]; samples that count then.
+#: Phase of a mode per sample from which on the next mode may be aliased [rad], and length from which a window counts.
 ALIASED, LONG = 2.0, 100
 #: Delay of a rate that its source has filtered [s].
 LATE = 0.005
-#: Standard deviations that noise may reach.
+#: Number of standard deviations that noise may reach.
 DEVIATIONS = 6.0
 
 
@@ -51,7 +52,7 @@ class Agreement:
     Attributes
     ----------
     changed, driven : ndarray, shape (2, n + m)
-        In each window: change of the value, and what the rate gives.
+        In each window, the change of the value, and the change that the rate gives.
     pairs : ndarray of int, shape (2, n + m)
         Index of each value, and of its rate.
     """
@@ -86,9 +87,9 @@ class Agreement:
         value : ndarray, shape (N,)
             Readings.
         dt : float
-            Since the last sample [s].
+            Time since the last sample [s].
         jitter : float
-            Of the stamps [s].
+            Jitter of the stamps [s].
         change : ndarray, shape (n,)
             Step of the torque in that time [N m].
 
@@ -115,7 +116,7 @@ class Agreement:
         return found if found.size else None
 
     def stands(self, j):
-        """Whether it is the value of pair j that does not change at all."""
+        """Whether the value of pair j does not change at all."""
         return not self._evidence[0][:, j].any()
 
     def words(self, j):

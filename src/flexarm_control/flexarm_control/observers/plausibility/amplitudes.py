@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Compares modal amplitudes with strains, where an arm's driver sends both.
+r"""Compares modal amplitudes with strains, if an arm's driver sends both.
 
-The amplitudes stand for the strains :math:`R\delta` on the gauges, with the rows R of the strain map, and the strains
-for :math:`R W\varepsilon` with its inverse W, which leaves what no amplitudes make. Both go through one `low_pass`:
+The amplitudes stand for the strains :math:`R\delta` at the gauges, with the rows R of the strain map. The strains stand
+for :math:`R W\varepsilon` with its inverse W, without the part that no amplitudes cause. Both pass the same `low_pass`:
 :math:`s = F[R W\varepsilon]`, :math:`d = F[R\delta] - s`. With the means :math:`s_0`, :math:`d_0` over the first
-`LEARNT` seconds, in which gauges without calibration have their bias,
+`LEARNT` seconds, which contain the bias of gauges without calibration,
 
 .. math:: |d - d_0| \le Z\varepsilon_{max} + S\,\widehat{|s - s_0|} + \tau\,\widehat{|\dot s|}
 
-for 0.6 % of full scale (Z), half of the strain (S = `SHARE`: another model's shapes or a gauge's gain make less, a
-wrong sign or a factor of two more), and the delay :math:`\tau` (`LATE`) of a source that filters. The hat is the
-largest value over all gauges in the last `KEPT` seconds or so. `PERSISTENT` samples in a row beyond the bound are
-evidence. Which of the two is wrong does not show.
+The bound allows 0.6 % of full scale (Z), half of the strain (S = `SHARE`: another model's shapes or a gauge's gain
+cause less, a wrong sign or a factor of two more), and the delay :math:`\tau` (`LATE`) of a source that filters. The hat
+is the largest value over all gauges in the last `KEPT` seconds or so. `PERSISTENT` samples in a row beyond the bound
+are evidence. This does not show which of the two is wrong.
 """
 
 from math import exp
@@ -25,7 +25,7 @@ from .low_pass import LowPass
 from .strain_law import corner_of
 from .zero_drift import LEARNT, ZERO
 
-#: Part of the strain by which the two may differ [-].
+#: Fraction of the strain by which the two may differ [-].
 SHARE = 0.5
 #: Time constant in which a large strain is forgotten [s].
 KEPT = 0.2
@@ -44,7 +44,7 @@ class SourceAmplitudes:
     Attributes
     ----------
     bound : float
-        What the largest difference may be [strain].
+        Bound of the largest difference [strain].
     """
 
     def __init__(self, channels, strain_map):
@@ -63,7 +63,7 @@ class SourceAmplitudes:
 
     @property
     def difference(self):
-        """Largest of the last sample over the gauges [strain]."""
+        """Largest difference over the gauges at the last sample [strain]."""
         return float(self._state[strains.DIFFERENCE])
 
     def update(self, value, dt):
@@ -72,10 +72,10 @@ class SourceAmplitudes:
         Parameters
         ----------
         value : ndarray, shape (N,)
-            As `Channels.read` has them. Without amplitudes or strains, or with a gauge at an end of its range, the past
-            is forgotten.
+            As from `Channels.read`. Without amplitudes or strains, or with a gauge at an end of its range, the past is
+            forgotten.
         dt : float
-            Since the last sample [s].
+            Time since the last sample [s].
 
         Returns
         -------

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The readings of an arm in one vector, and how fast and how exactly each can change.
+r"""Collects the readings of an arm in one vector, with the noise of each and bounds of its change.
 
 The vector is :math:`x = (q, \varepsilon, \delta, \dot q, \dot\delta)`: joint positions, strains, modal amplitudes and
-their rates; what a source does not give is NaN. With H the inverse of the mass matrix (3) and R the rows of the strain
-map, a step :math:`\Delta u` of the torque changes the accelerations by
+their rates. Values that a source does not give are NaN. With H the inverse of the mass matrix (3) and R the rows of the
+strain map, a step :math:`\Delta u` of the torque changes the accelerations by
 
 .. math:: |\Delta\ddot q| \le 2|H_{11}||\Delta u|, \qquad |\Delta\ddot\delta| \le 2|H_{21}||\Delta u|, \qquad
           |\Delta\ddot\varepsilon| \le 2|R H_{21}||\Delta u| ,
 
-the 2 for what the model has wrong.
+where the 2 allows for errors of the model.
 
-Whatever else acts (pushes, gravity, brakes) is taken to change the joints' accelerations by at most
-:math:`2|M_{11}^{-1}|u_{max}`, with the torque limit or the brake's torque, whichever is larger, and those of the
-deflections by a twentieth of what that torque would.
+Everything else that acts (pushes, gravity, brakes) is assumed to change the joints' accelerations by at most
+:math:`2|M_{11}^{-1}|u_{max}`, with the torque limit or the brake's torque, whichever is larger. The accelerations of
+the deflections change by at most a twentieth of what that torque would cause.
 """
 
 from itertools import pairwise
@@ -21,16 +21,16 @@ import numpy as np
 
 from ... import kernels
 
-#: Rms noise where the arm file states none: joint positions [rad], joint velocities [rad/s], and strains as a
-#: fraction of full scale [-]. What the first samples show is taken where it is larger.
+#: Rms noise if the arm file states none: joint positions [rad], joint velocities [rad/s], and strains as a
+#: fraction of full scale [-]. If the first samples show more, that is taken.
 UNSTATED_POSITION, UNSTATED_VELOCITY, UNSTATED_STRAIN = 1e-5, 1e-3, 1e-5
-#: And of modal amplitudes of an arm without gauges [m, rad].
+#: The same for modal amplitudes of an arm without gauges [m, rad].
 UNSTATED_AMPLITUDE = 1e-5
-#: For a payload, a configuration or a torque between two samples that is not the model's [-].
+#: Factor for a payload, a configuration or a torque between two samples that is not the model's [-].
 MARGIN = 2.0
-#: A joint with a larger ratio of these accelerations turns hardly anything but the end of a link that bends [-].
+#: A joint with a larger ratio of flexible to rigid accelerations turns hardly more than the end of a bending link [-].
 LIGHT = 3.0
-#: Configurations at which the largest accelerations are looked for.
+#: Number of configurations over which the largest accelerations are taken.
 CONFIGURATIONS = 16
 
 
@@ -51,11 +51,11 @@ class Channels:
     position, strain, amplitude, velocity, rate : slice
         Where each group is in the vector.
     is_rate : ndarray of bool, shape (N,)
-        Velocities and modal rates.
+        True for velocities and modal rates.
     noise : ndarray, shape (N,)
-        Rms.
+        Rms noise.
     range : tuple of ndarray, shape (g,)
-        Middle, and half of the width, of the gauges' ranges [strain].
+        Middle and half width of the gauges' ranges [strain].
     fastest : float
         Highest frequency of the model's modes; 0 for a rigid arm [rad/s].
     count : ndarray, shape (n,)
@@ -63,7 +63,7 @@ class Channels:
     gain : ndarray, shape (N, n)
         Change of acceleration per torque, in magnitude, `MARGIN` times the largest over the configurations.
     push : ndarray, shape (N,)
-        Change of acceleration by what is not reported; infinite where a joint has no torque limit.
+        Change of acceleration by causes that are not reported; infinite if a joint has no torque limit.
     heavy : bool
         Whether no joint accelerates more than `LIGHT` times faster than if the links were rigid, in any configuration.
     strength : ndarray, shape (n,)
@@ -143,7 +143,7 @@ class Channels:
         return gain, push
 
     def read(self, sample, out, raw):
-        """The readings of an `ArmSample` into `out`, shape (N,), and its (q, strain, qd) into `raw`, (2 n + g,)."""
+        """Read an `ArmSample` into `out`, shape (N,), and its (q, strain, qd) into `raw`, (2 n + g,)."""
         self._gather(
             sample.position,
             self._no_strain if sample.strain is None else sample.strain,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which sensors are in doubt, why, and until when."""
+"""Keeps which sensors are in doubt, why, and until when."""
 
 from ...loop.samples import ArmSample
 
@@ -15,7 +15,7 @@ class Doubts:
     trust : int
         The worst degree of the present doubts, as in `ArmSample`; TRUSTED if there is none.
     text : str
-        The first of the worst ones in words; empty if there is none.
+        Text of the first of the worst doubts; empty if there is none.
     raised : int
         Number of doubts so far.
     """
@@ -25,7 +25,7 @@ class Doubts:
         self.forget()
 
     def forget(self):
-        """No sensor is in doubt: the source has started again."""
+        """Forget all doubts, since the source has started again."""
         self._known = {}
         self.trust, self.text = ArmSample.TRUSTED, ""
 
@@ -41,7 +41,7 @@ class Doubts:
         text : str
             Which sensor, and what is wrong with it.
         stamp_ns : int
-            Of the sample [ns].
+            Stamp of the sample [ns].
         for_good : bool
             Whether the doubt lasts until the source starts again.
         """
@@ -70,7 +70,7 @@ class Doubts:
         return sensor in self._known
 
     def about_any(self, beginning):
-        """Whether a sensor is in doubt whose name has this `beginning`."""
+        """Whether any sensor whose name has this `beginning` is in doubt."""
         return any(name.startswith(beginning) for name in self._known)
 
     def _sum_up(self):

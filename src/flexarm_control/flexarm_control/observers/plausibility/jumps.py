@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Finds readings that no arm makes: each against the straight line through the ones before it.
+r"""Finds readings that no arm makes, by comparing each with the straight line through the ones before it.
 
 With the time h to the last sample and T the baseline of the slope s, :math:`\rho = h/T`,
 
@@ -7,14 +7,14 @@ With the time h to the last sample and T the baseline of the slope s, :math:`\rh
     r = x_k - (x_{k-1} + s h), \qquad
     |r| \le 6\sigma\sqrt{1 + (1+\rho)^2 + \rho^2} + (1+\rho)(c + 2J|s|) + S\,(a + G|\Delta u| + 2e)
 
-for the noise :math:`\sigma`, the encoder's step c, the stamps' jitter J (the largest deviation of late from the
+with the noise :math:`\sigma`, the encoder's step c, the stamps' jitter J (the largest recent deviation from the
 mean period), the accelerations a and :math:`G|\Delta u|` of `channels`, and S = h(h+T)/2 for positions, (h+T)/2 for
-rates. e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so: a motion that has begun may
-go on. A torque that is unknown, or zero on every joint, so that brakes may act, stands for a step of the largest
-torque; so do lost samples, for the links, and for `UNREPORTED` of it for the joints. The noise is the larger of
-what `channels` has and the rms of r so far. The first `LEARNT` samples are not judged.
+rates. e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so, since a motion that has begun
+may go on. A torque that is unknown, or zero on every joint, so that brakes may act, counts as a step of the largest
+torque. So do lost samples for the links; for the joints they count as `UNREPORTED` of it. The noise is the larger of
+the value in `channels` and the rms of r so far. The first `LEARNT` samples are not judged.
 
-A reading beyond its bound is replaced by the line, for `BRIDGED` samples in a row; after that the jump is real.
+A reading beyond its bound is replaced by the line, for `BRIDGED` samples in a row; after that the jump counts as real.
 """
 
 from math import exp, sqrt
@@ -25,25 +25,25 @@ from ... import kernels
 from ...arrays import some
 from ...kernels import readings
 
-#: Samples in a row whose reading is replaced; at the next one the jump is taken for lasting.
+#: Number of samples in a row whose reading is replaced; at the next one the jump counts as lasting.
 BRIDGED = 3
-#: Samples after a start that only show the noise.
+#: Number of samples after a start that only show the noise.
 LEARNT = 50
 #: A bound is this many standard deviations [-], and this multiple of the excess [-].
 DEVIATIONS, GROWTH = 6.0, 2.0
-#: Time in which an excess is forgotten, and one bridged reading [s].
+#: Times in which an excess, and one bridged reading, are forgotten [s].
 EXCESS_TIME, RARE_TIME = 0.02, 1.0
 #: More bridged readings of one sensor than this, each forgotten in `RARE_TIME`, are no single outliers.
 FREQUENT = 8.0
-#: Over more lost samples in a row deflections can't be extrapolated, nor over some in which the fastest mode turns by
-#: more than this [rad].
+#: Deflections can't be extrapolated over more lost samples in a row, nor over a gap in which the phase of the fastest
+#: mode turns by more than this [rad].
 MAX_STEPS, MAX_TURN = 3, 0.5
 #: Fraction of the largest torque that may have acted on the joints in lost samples, unreported [-].
 UNREPORTED = 0.1
 
 
 class Jumps:
-    """Judges each reading beside the ones before it.
+    """Judges each reading by the ones before it.
 
     Parameters
     ----------
@@ -52,15 +52,15 @@ class Jumps:
     Attributes
     ----------
     bridged : ndarray of int, shape (N,)
-        Number of readings that were replaced, since the observer was made.
+        Number of readings that were replaced since the observer was made.
     """
 
     def __init__(self, channels):
         self.channels = c = channels
-        # A slope over several samples is worth its delay only where readings are rounded.
+        # A slope over several samples is worth its delay only if readings are rounded.
         self.span = 4 if c.count.any() else 1
         self.bridged = np.zeros(c.size, int)
-        # What is extrapolated over lost samples at any length: joints.
+        # Joints are extrapolated over any number of lost samples.
         self._far = np.zeros(c.size, bool)
         self._far[c.position] = self._far[c.velocity] = True
         # The torque of lost samples is unknown; it moves the links soon, the joints later.
@@ -98,20 +98,20 @@ class Jumps:
         Parameters
         ----------
         value : ndarray, shape (N,)
-            NaN: not given. Replaced readings are written into it.
+            Readings; NaN: not given. Replaced readings are written into it.
         torque : ndarray, shape (n,)
-            Applied until the sample [N m].
+            Torque applied until the sample [N m].
         dt : float
             Time since the last sample [s].
         steps : int
-            Samples since then, lost ones included.
+            Number of samples since then, lost ones included.
 
         Returns
         -------
         outliers : ndarray of int or None
             Indices of the readings that were replaced.
         lasting : ndarray of int or None
-            And of those that jumped for good, which stay as they are; None in nearly all samples.
+            Indices of those that jumped for good, which stay as they are; None in nearly all samples.
         """
         c, past, times = self.channels, self._past, self._times
         self._kernels.arrive(value, torque, c.strength, self._rows, self._torques)
@@ -135,7 +135,7 @@ class Jumps:
 
     @property
     def _gap(self):
-        """Whether so much time was lost before this sample that a line says nothing of the deflections."""
+        """Whether too much time was lost before this sample to extrapolate the deflections by a line."""
         lost = self._steps > 1 and self.channels.fastest * self._dt > MAX_TURN
         return lost or self._steps > MAX_STEPS
 
@@ -157,21 +157,21 @@ class Jumps:
         Parameters
         ----------
         value : ndarray, shape (N,)
-            As `judge` left it.
+            Readings, as `judge` left them.
         stamp : float
-            Its time, from any origin [s].
+            Time of the sample, from any origin [s].
         """
         dt = self._dt
         if self._seen >= 2:
             self._learn(dt)
         self._kernels.remember(value, stamp, self._past, self._times, self._torques)
         if self._lasting is not None and self._lasting.size:
-            # The new level is where it goes on from; its slope shows in the next samples.
+            # The reading goes on from the new level; its slope shows in the next samples.
             self._past[:, self._lasting] = value[self._lasting]
             self._grace[self._lasting] = self.span + 2
             self._excess[self._lasting] = 0.0
         if self._gap:
-            # The slope over the gap is none of the present motion.
+            # The slope over the gap is not that of the present motion.
             self._grace[~self._far] = self.span + 2
         self._unseen = self._new_unseen
         self._seen += 1
@@ -183,7 +183,7 @@ class Jumps:
             self.jitter = max(self._late, 0.995 * self.jitter)
 
     def _learn(self, dt):
-        """Follow noise and excess, from the residuals of readings that were believed."""
+        """Update noise and excess from the residuals of readings that were not replaced."""
         if self._outliers is not None:
             self._replaced[self._outliers] = True
             self.bridged[self._outliers] += 1
@@ -194,20 +194,20 @@ class Jumps:
 
     @property
     def torque_change(self):
-        """Step of the torque before the sample that was judged last, (n,); a large one where it is unknown [N m]."""
+        """Step of the torque before the sample that was judged last, (n,); a large one if it is unknown [N m]."""
         return self._torques[readings.NEW_CHANGE]
 
     @property
     def rms(self):
-        """Of the readings' noise so far, as the residuals show it, shape (N,)."""
+        """Rms noise of the readings so far, by their residuals, shape (N,)."""
         return np.sqrt(self._square)
 
     def line(self, i):
-        """What reading i should have been."""
+        """Expected value of reading i."""
         return self._line[i]
 
     def read(self, i):
-        """What reading i was."""
+        """Actual value of reading i."""
         return self._value[i]
 
     def bound(self, i):
@@ -216,5 +216,5 @@ class Jumps:
 
     @property
     def frequent(self):
-        """Indices of the readings that were replaced too often of late."""
+        """Indices of the readings that were replaced too often lately."""
         return np.flatnonzero(self._often > FREQUENT) if some(self._often) else ()

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""A low pass whose states have the first and second derivative of what it lets through.
+r"""A low-pass filter whose states give the first and second derivative of its output.
 
 Three stages, :math:`\dot y_i = \omega(y_{i-1} - y_i)` with the input as :math:`y_0`, so that
 
 .. math:: \dot y_3 = \omega(y_2 - y_3), \qquad \ddot y_3 = \omega^2(y_1 - 2y_2 + y_3) .
 
-The input is taken for a straight line between two samples, whatever time h they are apart. With :math:`x = \omega h`,
-:math:`e_k = e^{-x}x^k/k!`, the step responses :math:`S_i = 1 - \sum_{k<i}e_k` and those of a ramp,
-:math:`R_i = 1 - \frac1x\sum_{k\le i}S_k`, a sample changes the states, exactly, to
+The input is taken for a straight line between two samples, whatever the time h between them. With
+:math:`x = \omega h`, :math:`e_k = e^{-x}x^k/k!`, the step responses :math:`S_i = 1 - \sum_{k<i}e_k` and the ramp
+responses :math:`R_i = 1 - \frac1x\sum_{k\le i}S_k`, a sample changes the states exactly to
 
 .. math:: y_i^+ = R_i u^+ + (S_i - R_i)u + \sum_{k<i}e_k\,y_{i-k} .
 """
@@ -37,7 +37,7 @@ class LowPass:
     rows : ndarray, shape (5, N)
         Last sample, the one before it, and the states :math:`y_1` to :math:`y_3`.
     weights : ndarray, shape (3, 5)
-        Of the sample, the one before it and the states, in each new state.
+        Weights of the sample, the one before it and the states in each new state.
     """
 
     def __init__(self, size, corner):
@@ -46,11 +46,11 @@ class LowPass:
         self.weights, self._dt = np.zeros((3, 5)), 0.0
 
     def start(self, signal):
-        """Take it for the past, shape (N,): as if it had stood still until now."""
+        """Begin with a `signal`, shape (N,), as if it had been constant until now."""
         self.rows[:] = signal
 
     def clear(self, part):
-        """Signals that have been zero until now: a slice."""
+        """Take the signals of the slice `part` as zero until now."""
         self.rows[:, part] = 0.0
 
     def update(self, signal, dt):

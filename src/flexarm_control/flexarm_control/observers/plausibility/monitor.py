@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Runs the checks of an arm's readings, and says what follows from them.
+r"""Runs the checks of an arm's readings, and decides what follows from them.
 
-`judge` looks at a sample before the observer sees it. A single outlier is replaced. `take` looks at it once the
-estimate is sent, as the past of the next one, which bears what is found:
+`judge` checks a sample before the observer takes it, and replaces a single outlier. `take` checks it again once the
+estimate is sent, as the past of the next sample. The next sample then carries what is found:
 
 ============================================  =======================================================
 a joint position that jumps or stands still   DISTRUSTED: the loop can't do without it
 a joint velocity that does not fit            STOP; the estimate is used in its place
-a gauge that jumps, or stands still           STOP, without that gauge; DISTRUSTED where the others don't suffice
+a gauge that jumps, or stands still           STOP, without that gauge; DISTRUSTED if the others don't suffice
 strains of wrong sign, exchanged gauges       the same
 a gauge whose zero drifts                     STOP, without that gauge, or with its drift taken out
 strains and a joint that contradict           STOP
-modal amplitudes that jump                    STOP, from the strains; DISTRUSTED without them
+modal amplitudes that jump                    STOP, amplitudes from the strains; DISTRUSTED without strains
 modal rates that do not fit                   STOP; they are not used
-amplitudes and strains that contradict        STOP, from the strains, if the amplitudes have jumped; else DISTRUSTED:
-                                              which of the two is wrong does not show
+amplitudes and strains that contradict        STOP, amplitudes from the strains, if the amplitudes have jumped;
+                                              otherwise DISTRUSTED, as it does not show which of the two is wrong
 more than `jumps.FREQUENT` outliers           STOP
 ============================================  =======================================================
 """
@@ -40,16 +40,16 @@ PARAMETERS = (
         " replaced, a sensor in doubt is named, and the arm is stopped or its torque switched off."
     ),
     parameter("payload_tolerance", TOLERANCE, "-", 0.0, 100.0, read_only=True).described(
-        "By which fraction the payload may differ from the arm file's before strains and motion are taken to contradict"
-        " each other; 2.0: from none to three times as much. Less finds a gauge that drifts sooner."
+        "Fraction by which the payload may differ from the arm file's before strains and motion count as contradictory;"
+        " 2.0: from none to three times as much. A smaller value finds a gauge that drifts sooner."
     ),
 )
 
-#: The mean interval of the stamps over a short and a long time may differ by this factor.
+#: The mean intervals of the stamps over a short and a long time may differ by this factor.
 RATE_CHANGE = 1.5
-#: Doubt about gauges whose zero drifts.
+#: Name of the doubt about gauges whose zero drifts.
 DRIFT = "strain of drifting gauges"
-#: Weight of the short mean in the long one, and samples for which they differ.
+#: Weight of the short mean in the long one, and number of samples for which they must differ.
 SLOWLY, RATE_SAMPLES = 0.002, 100
 
 
@@ -61,16 +61,16 @@ class Monitor:
     model : ArmModel
     strain_map : StrainMap or None
     gauges : GaugeHealth or None
-        It leaves out those in doubt.
+        It leaves out gauges in doubt.
     payload : float
-        By which fraction the payload may differ from the arm file's [-].
+        Fraction by which the payload may differ from the arm file's [-].
 
     Attributes
     ----------
     doubts : Doubts
     jumps : Jumps
     stamp_ns : int
-        Of the last sample that was taken [ns].
+        Stamp of the last sample that was taken [ns].
     """
 
     def __init__(self, model, strain_map, gauges, payload=TOLERANCE):
@@ -86,7 +86,7 @@ class Monitor:
         self.reset()
 
     def reset(self):
-        """A new session, or a gap: forget the past, doubts included."""
+        """Forget the past, doubts included, for a new session or after a gap."""
         self.doubts.forget()
         self.jumps.reset()
         self._agreement.reset()
@@ -101,7 +101,7 @@ class Monitor:
 
     @property
     def bridged(self):
-        """Replaced readings by sensor: those with at least one."""
+        """Number of replaced readings by sensor, for sensors with at least one."""
         names, counts = self.channels.names, self.jumps.bridged
         return {names[i]: int(counts[i]) for i in np.flatnonzero(counts)}
 
@@ -111,16 +111,16 @@ class Monitor:
         Parameters
         ----------
         sample : ArmSample
-            Readings that can't be are replaced, or taken out.
+            Readings that can't be true are replaced, or taken out.
         dt : float
             Time since the last one [s]; 0.0 at a start.
         steps : int
-            Samples since then.
+            Number of samples since then.
 
         Returns
         -------
         bool
-            Whether the observer must start afresh: a joint's position has jumped for good.
+            Whether the observer must start again because a joint's position has jumped for good.
         """
         c, value = self.channels, self._value
         c.read(sample, value, self._raw)
@@ -143,7 +143,7 @@ class Monitor:
         return afresh
 
     def _replace(self, sample, value):
-        """Write replaced readings into the sample, in arrays of our own."""
+        """Write replaced readings into the sample, in the monitor's own arrays."""
         c = self.channels
         sample.position[:] = value[c.position]
         if sample.velocity_known:
@@ -158,7 +158,7 @@ class Monitor:
                 setattr(sample, name, own)
 
     def _jumped(self, sample, lasting):
-        """What follows from readings that jumped for good; whether a joint position is one."""
+        """Note doubts about readings that jumped for good; returns whether the observer must start again."""
         c, jumps, stamp = self.channels, self.jumps, sample.stamp_ns
         strains = [int(i) - c.strain.start for i in lasting if c.strain.start <= i < c.strain.stop]
         still = self._standstill.still
@@ -198,7 +198,7 @@ class Monitor:
         return self._afresh(lasting)
 
     def _afresh(self, lasting):
-        """Whether the observer must start afresh after these jumps."""
+        """Whether the observer must start again after these jumps."""
         if not (lasting < self.channels.n).any():
             return False
         self._agreement.reset()
@@ -207,7 +207,7 @@ class Monitor:
         return True
 
     def _wiring(self, strains):
-        """The wiring that explains strains which jumped, in words; empty if none does."""
+        """Text that names the wiring that explains jumped strains; empty if none does."""
         jumps, first = self.jumps, self.channels.strain.start
         was = np.array([jumps.line(first + i) for i in strains])
         now = np.array([jumps.read(first + i) for i in strains])
@@ -226,7 +226,7 @@ class Monitor:
         return " and ".join(self.channels.model.arm.gauge_names[i] for i in indices)
 
     def _without(self, indices, text, stamp_ns):
-        """Leave gauges out, or distrust the state where the others don't suffice."""
+        """Leave gauges out, or distrust the state if the others don't suffice."""
         self._gauges.doubt(indices)
         lost = tuple(np.flatnonzero(self._gauges.doubted).tolist())
         enough = self._map.possible_without(lost)
@@ -234,7 +234,7 @@ class Monitor:
         self.doubts.add(f"strain of {self._named(indices)}", degree, text, stamp_ns)
 
     def _take_out(self, sample):
-        """Take out of the sample what is in doubt and can be done without."""
+        """Take readings in doubt out of the sample, if the loop can do without them."""
         c, doubts = self.channels, self.doubts
         if doubts.trust == ArmSample.TRUSTED:
             return
@@ -246,7 +246,7 @@ class Monitor:
             sample.rate = None
 
     def take(self, sample):
-        """Remember a sample that the observer has taken, and look for what shows over several of them.
+        """Remember a sample that the observer has taken, and look for errors that show over several samples.
 
         Parameters
         ----------
@@ -267,7 +267,7 @@ class Monitor:
         self.stamp_ns = stamp
 
     def mark(self, sample):
-        """Set `trust` and `doubt` of a sample that was taken, or of its repetition; its source's own come first."""
+        """Set `trust` and `doubt` of a sample, or of its repetition, unless those of its source are as severe."""
         if self.doubts.trust > sample.trust:
             sample.trust, sample.doubt = self.doubts.trust, self.doubts.text
 
@@ -318,7 +318,7 @@ class Monitor:
             self._drifting(stamp)
 
     def _compare_amplitudes(self, stamp):
-        """Amplitudes that the source's own strains contradict."""
+        """Note a doubt about amplitudes that the source's own strains contradict."""
         c, check = self.channels, self._amplitudes
         if self._gauges is not None and some(self._gauges.doubted):
             check.reset()
@@ -326,7 +326,7 @@ class Monitor:
         if not check.update(self._value, self._dt):
             return
         jumped = [name for name in c.names[c.amplitude] if self.doubts.about(name)]
-        if jumped:  # that was the beginning: the source's own strains went on without it
+        if jumped:  # this jump was the beginning, and the source's own strains did not show it
             for name in jumped:
                 self.doubts.add(name, ArmSample.STOP, "", stamp, for_good=True)
         else:
@@ -339,7 +339,7 @@ class Monitor:
             self.doubts.add("modal_amplitude or strain", ArmSample.DISTRUSTED, text, stamp)
 
     def _drifting(self, stamp):
-        """What follows from strains that the motion does not explain."""
+        """Note doubts about strains that the motion does not explain."""
         c, law = self.channels, self._law
         drift = law.drift
         if not drift.found.size:
@@ -363,20 +363,20 @@ class Monitor:
             drift.doubted[drift.found] = True
 
     def correct(self, amplitude, inverse):
-        """Take drifts of gauges that can't be left out from the modal amplitudes, shape (m,).
+        """Subtract drifts of gauges that can't be left out from the modal amplitudes, shape (m,).
 
         Parameters
         ----------
         amplitude : ndarray, shape (m,)
-            From the strains.
+            Amplitudes from the strains.
         inverse : ndarray, shape (m, g)
-            Of the strain map, that made them.
+            Inverse of the strain map that gave them.
         """
         if self._law is not None and some(self._law.drift.correction):
             amplitude -= inverse @ self._law.drift.correction
 
     def calibrated(self):
-        """The gauges have another bias now: their zeros are learnt anew."""
+        """Learn the zeros of the gauges again, since they have another bias now."""
         if self._law is not None:
             self._law.reset()
             self._amplitudes.reset()
@@ -386,7 +386,7 @@ class Monitor:
         self.doubts.add("frame", ArmSample.DISTRUSTED, text, stamp_ns)
 
     def _disagree(self, pairs, stamp):
-        """Rates that do not fit their values."""
+        """Note doubts about rates that do not fit their values."""
         c, agreement = self.channels, self._agreement
         for j in pairs:
             value, rate = (c.names[i] for i in agreement.pairs[:, j])

@@ -2,22 +2,22 @@
 r"""Finds readings that stand still although they should not.
 
 A reading is still while it is the same to the last bit. Quantised readings of an arm at rest are still, too, and so
-is a simulated arm that is exactly at rest; therefore stillness alone is no evidence. It is
+is a simulated arm that is exactly at rest. Therefore stillness alone is no evidence. It is evidence
 
-1. of a strain gauge, of a joint velocity that is not zero, or of the whole frame (all joints and gauges), when it
-   lasts `ABRUPT` samples and began abruptly: over the `BEFORE` samples before, the reading changed on average by more
+1. for a strain gauge, a joint velocity that is not zero, or the whole frame (all joints and gauges), if it lasts
+   `ABRUPT` samples and began abruptly: over the `BEFORE` samples before, the reading changed on average by more
    than `TIMES` times its smallest change so far, and so it did in one of the last two. A smooth motion that ends, or
-   turns, changes by ever less before it is still: less than twice the step of a converter in a sample. Where both of
-   the last two changes are smaller, a fast vibration may turn; it is not still for twice `ABRUPT` samples then.
-2. of a gauge whose noise is stated and has been seen: with the probability :math:`p =
-   \mathrm{erf}(s/2\sqrt2\sigma)` of the most probable count, s its step, when it lasts N samples with :math:`p^N <
-   10^{-14}`. The noise has been seen when the readings' rms in `jumps` is at least half of it.
-3. of a joint, when the torque should have moved it. With :math:`\bar u` the torque less the arm's weight, and what
-   the bent links do to joints that stand, :math:`M_{12}M_{22}^{-1}(K_2\delta + f_2)`, the rigid arm accelerates by
-   :math:`a = M_{11}^{-1}\bar u`. Friction, and what weight, bending and the gauges' noise leave unsure, is up to
-   :math:`\Delta u` of each joint, of those that turn as well, and may take :math:`|M_{11}^{-1}|\Delta u` from it: a
-   joint that carries others feels what they do. What is left of a since the joint has been still is integrated: it
-   should have turned by more than `TRAVEL` of its encoder's steps, or of its noise.
+   turns, changes ever less before it is still: by less than twice the step of a converter in a sample. If both of
+   the last two changes are smaller, a fast vibration may be turning, which is not still for twice `ABRUPT` samples.
+2. for a gauge whose noise is stated and has been seen, if it lasts N samples with :math:`p^N < 10^{-14}`. Here
+   :math:`p = \mathrm{erf}(s/2\sqrt2\sigma)` is the probability of the most probable count, with the gauge's step s.
+   The noise has been seen if the readings' rms in `jumps` is at least half of it.
+3. for a joint, if the torque should have moved it. Let :math:`\bar u` be the torque less the arm's weight, plus the
+   effect of the bent links on joints that stand, :math:`M_{12}M_{22}^{-1}(K_2\delta + f_2)`. The rigid arm then
+   accelerates by :math:`a = M_{11}^{-1}\bar u`. Friction, and the uncertainty of weight, bending and the gauges' noise,
+   are up to :math:`\Delta u` at each joint, also at those that turn. They may take :math:`|M_{11}^{-1}|\Delta u` from
+   a, since a joint that carries others feels their effect. The rest of a is integrated from when the joint became
+   still: it should have turned by more than `TRAVEL` of its encoder's steps, or of its noise.
 """
 
 import numpy as np
@@ -30,13 +30,13 @@ from .jumps import DEVIATIONS
 
 #: Samples that an abrupt stillness lasts until it is noticed; samples before it; and the ratio of changes.
 ABRUPT, BEFORE, TIMES = 6, 8, 6.0
-#: Steps of its encoder that the torque must move a joint by.
+#: Number of encoder steps by which the torque must move a joint.
 TRAVEL = 10.0
-#: A change of a strain below this fraction of its noise is none.
+#: A change of a strain below this fraction of its noise counts as none.
 SLIGHT = 1e-6
 #: Probability of a false alarm in one run of samples.
 RARE = 1e-14
-#: Torque that friction which the arm file does not state may hold, as a fraction of the limit; and of the weight.
+#: Torque that friction not in the arm file may hold, as a fraction of the limit; and uncertain fraction of the weight.
 FRICTION, WEIGHT = 0.05, 0.4
 
 
@@ -50,7 +50,7 @@ class Standstill:
     Attributes
     ----------
     still : ndarray of int, shape (n + g + n,)
-        For how many samples each joint position, gauge and joint velocity has been the same.
+        Number of samples for which each joint position, gauge and joint velocity has been the same.
     """
 
     def __init__(self, channels):
@@ -94,13 +94,13 @@ class Standstill:
         Parameters
         ----------
         readings : ndarray, shape (n + g + n,)
-            Joint positions, strains and joint velocities as they came; NaN: not given.
+            Joint positions, strains and joint velocities as received; NaN: not given.
         torque : ndarray, shape (n,)
-            NaN: unknown.
+            Torque; NaN: unknown.
         noise : ndarray, shape (g,)
-            Rms of the gauges' readings so far.
+            Rms noise of the gauges' readings so far.
         dt : float
-            Since the last sample [s].
+            Time since the last sample [s].
         amplitude : ndarray, shape (m,), optional
             Modal amplitudes.
 
@@ -161,7 +161,7 @@ class Standstill:
         return np.flatnonzero(found) if moved else NONE
 
     def _hold(self, position):
-        """What moves joints that stand in a configuration, (n,), and what holds them."""
+        """Set what moves joints that stand in a configuration, (n,), and what holds them."""
         n = self.channels.n
         terms = self.channels.model.terms(position, np.zeros(n))
         self._inertia = np.linalg.inv(terms.M[:n, :n])
@@ -173,7 +173,7 @@ class Standstill:
 
 
 def _needed(gauge):
-    """Equal readings in a row that a gauge's noise rules out."""
+    """Number of equal readings in a row that a gauge's noise rules out."""
     if not gauge.noise > 0.0:
         return np.inf
     if not gauge.step:

@@ -1,35 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Compares the strains with the motion of the joints that bends the links: wrong signs, exchanged gauges.
+r"""Compares the strains with the motion of the joints, which bends the links, to find wrong signs and exchanged gauges.
 
 The second row of (2), without damping, multiplied by :math:`R K_2^{-1}`,
 
 .. math:: z + p = 0, \qquad z = R\left(\delta + K_2^{-1}M_{22}\ddot\delta\right), \quad
           p = R K_2^{-1}\left(M_{21}\ddot q + f_2\right),
 
-says what the strains and their acceleration must be for a motion of the joints, whatever torque, friction or brake
-makes it; :math:`\delta = W(\varepsilon - b)`. Strains, joint positions and :math:`f_2` go through the same
-`low_pass`, which has their second derivatives, and z and p through the same high pass, so that neither the bias of a
-gauge nor an unknown payload's weight counts. (`zero_drift` judges z and p without it.) The misfit of the readings
+gives the strains and their acceleration for a motion of the joints, whatever torque, friction or brake causes it, with
+:math:`\delta = W(\varepsilon - b)`. Strains, joint positions and :math:`f_2` pass the same `low_pass`, which gives
+their second derivatives. z and p pass the same high-pass filter, so that neither the bias of a gauge nor an unknown
+payload's weight counts. (`zero_drift` judges z and p without this filter.) The misfit of the readings
 
 .. math:: r = \frac{\overline{|z + p|^2}}{\overline{|z|^2} + \overline{|p|^2}}
 
-is 0 where they fit, 1 where they have nothing in common, 2 where the sign is wrong; a payload that is 30 % off
-makes 0.03. When r of the gauges on a link is above `MISFIT` for `PERSISTENT` comparisons, the same samples are
-judged under each hypothesis: one gauge or all of a link with the other sign, two gauges exchanged. The one with the
-smallest r is named if its r is `RATIO` times smaller and below `FIT`. Strains that are small beside their noise,
-stated or seen, raise no question.
+is 0 if they fit, 1 if they have nothing in common, 2 if the sign is wrong; a payload that is 30 % off causes 0.03.
+If r of the gauges on a link is above `MISFIT` for `PERSISTENT` comparisons, the same samples are judged under each
+hypothesis: one gauge or all of a link with the other sign, two gauges exchanged. The one with the smallest r is named
+if its r is `RATIO` times smaller and below `FIT`. Strains that are small compared with their noise, stated or seen,
+are not judged.
 
-A hypothesis T may have begun a moment ago. The low pass is linear, so with the strains that it was given since the
-moment, :math:`F[\varepsilon 1_{t\ge t_0}]`, it would have given
+A wiring T may have begun only a moment ago. The low pass is linear. So from the strains since that moment,
+:math:`F[\varepsilon 1_{t\ge t_0}]`, its output would have been
 :math:`F[\varepsilon] + (T - 1)F[\varepsilon 1_{t\ge t_0}]`. Each hypothesis is judged from the beginning, and for
-`ONSETS` moments, `EVERY` apart, that move on with time: so the filter's memory of right strains does not delay the
-answer. What an offset of a single gauge explains as well is left to `zero_drift`, and what a positive factor of all
-strains explains as well is no wiring: play and a wrong payload make that, and exchanged gauges of a link with one mode.
+`ONSETS` moments, `EVERY` apart, that move on with time, so that the filter's memory of right strains does not delay
+the result. If an offset of a single gauge explains the misfit as well, it is left to `zero_drift`. If a positive factor
+of all strains explains it as well, it is no wiring: play and a wrong payload cause such a factor, and so do exchanged
+gauges of a link with one mode.
 
-A hypothesis is no answer where its strains are small beside what a free oscillation moves: what
-gauges read that are exchanged says nothing of that, so it is judged as the hypothesis reads them. Arms with light
-joints (`Channels.heavy`) are not judged: there large inertias cancel in z and p, and a payload that is 30 % off can
-turn their signs.
+A hypothesis is not accepted if its strains are small compared with what a free oscillation moves. The readings of
+exchanged gauges do not show this, so it is judged with the strains of the hypothesis. Arms with light joints
+(`Channels.heavy`) are not judged: there large inertias cancel in z and p, and a payload that is 30 % off can turn their
+signs.
 """
 
 from itertools import combinations
@@ -47,28 +48,28 @@ CORNER, MIN_CORNER, MAX_CORNER = 3.0, 15.0, 60.0
 WASHOUT = 0.4
 #: Time constants of the low pass after which its start is forgotten, and over which readings are interpolated [-].
 SETTLED, GAP = 12.0, 0.7
-#: Time between two comparisons, over which they are averaged, and between new mass matrices [s].
+#: Times between two comparisons, over which they are averaged, and between new mass matrices [s].
 INTERVAL, MEMORY, RENEWAL = 0.008, 0.064, 0.04
-#: Misfit that raises the question [-], and for how many comparisons.
+#: Misfit above which hypotheses are judged [-], and for how many comparisons.
 MISFIT, PERSISTENT = 0.12, 3
-#: The hypothesis that wins has a misfit below the first, and smaller by the second [-].
+#: The hypothesis that wins has a misfit below the first value, and smaller than the nominal one by the second [-].
 FIT, RATIO = 0.05, 5.0
-#: And smaller than that of every other hypothesis by this factor [-], in so many comparisons in a row.
+#: It is also smaller than that of every other hypothesis by this factor [-], in this many comparisons in a row.
 DISTINCT, CONFIRMED = 3.0, 3
-#: Nor does a wiring win where the misfit is below `FIT` with all strains of a link larger or smaller, by a factor up to
-#: this [-]: a payload, a play or a stiffness that the file has not makes that.
+#: No wiring wins if the misfit is below `FIT` with all strains of a link larger or smaller, by a factor up to this [-]:
+#: a payload, play or stiffness that the file does not have causes that.
 SCALE = 2.0
-#: Strains are judged when z and p are this many times larger than their noise, and this fraction of |z - epsilon|.
+#: Strains are judged if z and p are this many times larger than their noise, and this fraction of |z - epsilon|.
 CLEAR, DRIVEN = 8.0, 0.5
-#: And the strains are at least this fraction of z and p: else inertias cancel, and the model is not exact enough.
+#: The strains must also be at least this fraction of z and p: else inertias cancel, and the model is not exact enough.
 STRAINED = 0.2
 #: Rms of a low-passed white noise over its own: this times the root of corner and sampling interval [-].
 WHITE = np.sqrt(3.0 / 16.0)
 #: Moments at which a wrong wiring may have begun, and the time between them [s].
 ONSETS, EVERY = 8, 0.03
-#: Of times [s], and of squares that are divided by.
+#: Rounding of times [s], and of squares that are divisors.
 ROUNDING, TINY = 1e-9, 1e-300
-#: Counts of an encoder are not white: largest second derivative of a low-passed step, over its size and corner^2 [-].
+#: Encoder counts are not white: largest second derivative of a low-passed step, over its size and corner^2 [-].
 STEP = 0.3
 
 
@@ -80,7 +81,7 @@ class StrainLaw:
     channels : Channels
     strain_map : StrainMap
     payload : float
-        By which fraction the payload may differ from the arm file's [-].
+        Fraction by which the payload may differ from the arm file's [-].
 
     Attributes
     ----------
@@ -88,7 +89,7 @@ class StrainLaw:
     drive : ndarray, shape (g, n)
         Strain per joint acceleration at the present configuration.
     misfits : float, float
-        Of the hypothesis that won: as the arm file has it, and so read.
+        Misfits for the hypothesis that won: with the arm file's wiring, and with the hypothesis.
     """
 
     def __init__(self, channels, strain_map, payload=TOLERANCE):
@@ -125,14 +126,14 @@ class StrainLaw:
         self.drift.reset()
 
     def _begin(self, position, velocity):
-        """Begin with this sample: what came before a gap tells nothing of what moved in it. The drift is kept."""
+        """Begin with this sample, since the samples before a gap do not show the motion in it; the drift is kept."""
         g = self.channels.g
         self._sums, self._run = np.zeros((2, g)), np.zeros(g, int)
         self._number = self._samples = self._oldest = self._same = 0
         self._best = None
         self._since = self._until = 0.0
         self._renew(position, velocity)
-        self._low.start(self._now)  # an arm that moves looks as if it had been hit
+        self._low.start(self._now)  # an arm that moves then looks as if it had been hit
         self._settling = SETTLED / self.corner
 
     def update(self, position, strain, velocity, dt, noise):
@@ -143,21 +144,21 @@ class StrainLaw:
         position, velocity : ndarray, shape (n,)
         strain : ndarray, shape (g,)
         dt : float
-            Since the last sample [s].
+            Time since the last sample [s].
         noise : ndarray, shape (g,)
-            Rms of the gauges' readings so far; counts where it is above the stated one.
+            Rms noise of the gauges' readings so far; counts where it is above the stated one.
 
         Returns
         -------
         compared : bool
-            Whether this sample ended an interval, so that `drift` is new. Not where a gauge is at an end of its range:
-            then the past is forgotten.
+            Whether this sample ended an interval, so that `drift` is new. If a gauge is at an end of its range, it is
+            false, and the past is forgotten.
         wiring : int or None
             Index of the hypothesis that wins against the arm file's wiring.
         """
         now, self._noise = self._now, noise
         if not self._kernels.pick_up(strain, position, *self.channels.range, self._moments, now):
-            self.reset()  # cut off, it follows no law
+            self.reset()  # a reading that is cut off follows no law
             return False, None
         if self._inertia is None or dt > GAP / self.corner:
             self._begin(position, velocity)
@@ -179,9 +180,9 @@ class StrainLaw:
         return True, self._compare(since)
 
     def _renew(self, position, velocity):
-        """Mass matrix and forces of the present configuration."""
+        """Set mass matrix and forces of the present configuration."""
         terms = self.model.terms(position, velocity)
-        if self._inertia is None or self.channels.n > 1:  # that of a single joint's arm stays
+        if self._inertia is None or self.channels.n > 1:  # that of an arm with a single joint stays
             self.drive, self._load, self._bend = law_matrices(self.model, self._map, terms)
         self._inertia, self._age = terms.M, 0.0
         first = self.channels.g + self.channels.n
@@ -214,7 +215,7 @@ class StrainLaw:
         return self._decide()
 
     def _begin_anew(self, fast):
-        """Let the oldest of the moments be now."""
+        """Set the oldest of the moments to now."""
         i, self._until = self._oldest, EVERY
         self._oldest = (i + 1) % ONSETS
         g, first = self.channels.g, self._young.start
@@ -224,7 +225,7 @@ class StrainLaw:
         self._history[:, rows] = 0.0
 
     def _noise_of_law(self):
-        """What noise makes of z and p, summed over a link's gauges, by gauge."""
+        """Effect of noise on z and p, summed over a link's gauges, by gauge."""
         c, w = self.channels, self.corner
         left = WHITE**2 * w * self._interval  # of a white noise's square
         gauge = left * np.maximum(c.noise[c.strain], self._noise) ** 2
@@ -255,7 +256,7 @@ class StrainLaw:
         gain = np.where(asked & (rest < FIT), nominal / rest, 0.0)
         best = int(np.argmax(gain))
         self.misfits = float(nominal[best]), float(rest[best])
-        # An offset of one gauge explains as much as its mean residual: a zero that drifts is no wrong wiring.
+        # An offset of one gauge explains as much as its mean residual; a zero that drifts is no wrong wiring.
         residual, concerned = z + p, self._concerned[best]
         offset = concerned * residual.mean(axis=0) ** 2
         left = concerned @ (residual**2).mean(axis=0) - offset.max()
@@ -268,7 +269,7 @@ class StrainLaw:
         return best if self._same >= CONFIRMED else None
 
     def _fit(self, strain, acceleration, p):
-        """Misfit of each hypothesis' strains, (h, kept, g) each; infinite where inertias cancel."""
+        """Misfit of the strains of each hypothesis, (h, kept, g) each; infinite where inertias cancel."""
         moved = acceleration @ self._load.T
         z = strain @ self._project.T + moved
         parts = (z + p) ** 2, z * z + p * p, strain**2, moved**2
@@ -280,7 +281,7 @@ class StrainLaw:
 
 
 def _scaled(z, p):
-    """Misfit that is left when the strains are a factor within `SCALE` larger or smaller."""
+    """Misfit that is left when the strains are larger or smaller by the best factor within `SCALE`."""
     zz, pp, zp = (float(np.sum(part)) for part in (z * z, p * p, z * p))
     factor = min(max(-zp / zz, 1.0 / SCALE), SCALE) if zz > 0.0 else 1.0
     return (factor**2 * zz + 2.0 * factor * zp + pp) / max(factor**2 * zz + pp, TINY)
@@ -292,7 +293,7 @@ def corner_of(model):
 
 
 def _hypotheses(gauges, places):
-    """Words, gauges and map (g, g) from readings to strains of each wrong wiring."""
+    """Text, gauges and map (g, g) from readings to strains, for each wrong wiring."""
     names, count = [g.name for g in gauges], len(gauges)
     for i in range(count):
         T = np.eye(count)

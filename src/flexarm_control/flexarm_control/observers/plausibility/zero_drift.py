@@ -1,33 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Finds gauges whose zero moves too slowly for a jump, and readings of a joint that the links do not follow.
+r"""Finds gauges whose zero drifts, too slowly for a jump, and readings of a joint that the links do not follow.
 
 The law of `strain_law`, without its high pass, gives for each gauge the strain that the motion of the joints and the
 links' own inertia do not explain,
 
 .. math:: r = \varepsilon - R\delta_p, \qquad R\delta_p = -(R K_2^{-1}M_{22}\ddot\delta + p),
 
-of which a low pass with the time constant :math:`\tau` (`SLOW`) is judged beside its mean over the first `LEARNT`
-seconds in which the arm hardly accelerates, the zero :math:`r_0`:
+r passes a low-pass filter with the time constant :math:`\tau` (`SLOW`). The result is compared with the zero
+:math:`r_0`, which is its mean over the first `LEARNT` seconds in which the arm hardly accelerates:
 
 .. math::
     |\bar r - r_0| \le Z\varepsilon_{max} + \Pi\,
     \overline{\left(|\Delta D||\ddot q| + |\Delta L||\ddot\varepsilon|\right)} + \Pi\,\Delta W\sum_j|q_j - q_{j0}|
 
-with 0.6 % of full scale for the zero (Z = `ZERO`), and :math:`\Delta D`, :math:`\Delta L`, :math:`\Delta W` the
-largest changes of :math:`R K_2^{-1}M_{21}`, :math:`R K_2^{-1}M_{22}W` and of the weight's strain under a payload that
-is off by `payload_tolerance`, over some configurations; :math:`\Pi` is `MARGIN`. Noise is not in the bound: the low
-pass leaves less than a tenth of a gauge's noise, and of an encoder's counts less than half a microstrain.
+with 0.6 % of full scale for the zero (Z = `ZERO`). :math:`\Delta D`, :math:`\Delta L` and :math:`\Delta W` are the
+largest changes of :math:`R K_2^{-1}M_{21}`, :math:`R K_2^{-1}M_{22}W` and the weight's strain, over some
+configurations, for a payload that is off by `payload_tolerance`; :math:`\Pi` is `MARGIN`. The bound does not contain
+noise: the low pass leaves less than a tenth of a gauge's noise, and less than half a microstrain of encoder counts.
 
 A zero that drifts at the rate v is found when it has left its bound b by :math:`v\tau`,
 
 .. math:: t = b/v + \tau + 3/\omega_f ,
 
-with the corner :math:`\omega_f` of the law's low pass; so no later than :math:`\tau + 3/\omega_f` after it has left the
-bound, at any rate. A drift that stays within it looks the same as another payload. From then on r less its zero is
-taken from the reading, late by `CORRECTED` + :math:`3/\omega_f`: what is left of a drift is v times that.
+with the corner :math:`\omega_f` of the law's low pass. This is no later than :math:`\tau + 3/\omega_f` after it has
+left the bound, whatever the rate v. A drift within the bound looks the same as another payload. From then on r minus
+its zero is subtracted from the reading, late by `CORRECTED` + :math:`3/\omega_f`; v times this delay is left of a
+drift.
 
-When all residuals together are what a wrong acceleration of one joint makes, :math:`r = R K_2^{-1}M_{21}a`, its
-position may be wrong as well as the strains, or something pushes the arm: joint and gauges are named together.
+If all residuals together are those of a wrong acceleration of one joint, :math:`r = R K_2^{-1}M_{21}a`, its position
+may be wrong as well as the strains, or something pushes the arm. Joint and gauges are then named together.
 """
 
 from math import exp
@@ -41,15 +42,15 @@ from flexarm_dynamics.models import model as models
 from ... import kernels
 from ...kernels import strains
 
-#: Change of a zero that is none, as a fraction of full scale [-]; margin of what a payload does [-].
+#: Change of a zero that counts as none, as a fraction of full scale [-]; margin for the effect of a payload [-].
 ZERO, MARGIN = 0.006, 1.2
-#: By which fraction a payload may differ from the arm file's where nothing else is stated [-].
+#: Fraction by which a payload may differ from the arm file's if nothing else is stated [-].
 TOLERANCE = 2.0
 #: Time constant of the low pass, time in which the zero is learnt, and time constant of the correction [s].
 SLOW, LEARNT, CORRECTED = 0.2, 0.2, 0.05
-#: Part of the residuals' square that no joint's acceleration explains, for a joint to be named [-].
+#: A joint is named if its acceleration leaves less than this fraction of the residuals' square unexplained [-].
 UNEXPLAINED = 0.03
-#: Configurations at which the payload's effect is looked for.
+#: Number of configurations over which the payload's effect is taken.
 CONFIGURATIONS = 8
 
 
@@ -61,18 +62,18 @@ class ZeroDrift:
     channels : Channels
     strain_map : StrainMap
     payload : float
-        By which fraction the payload may differ from the arm file's [-].
+        Fraction by which the payload may differ from the arm file's [-].
 
     Attributes
     ----------
     residual, bound : ndarray, shape (g,)
-        Low-passed residual less its zero, and what it may be [strain].
+        Low-passed residual minus its zero, and its bound [strain].
     found : ndarray of int
         Gauges beyond their bound.
     doubted : ndarray of bool, shape (g,)
         Gauges whose drift is taken out of the amplitudes; the monitor sets it.
     correction : ndarray, shape (g,)
-        What is taken from the readings: follows the residual of those that are doubted, r less its zero [strain].
+        Subtracted from the readings; it follows the residual of those that are doubted, r minus its zero [strain].
     """
 
     def __init__(self, channels, strain_map, payload=TOLERANCE):
@@ -104,9 +105,9 @@ class ZeroDrift:
         acceleration : ndarray, shape (g + n,)
             Second derivatives of strains and joint positions.
         position : ndarray, shape (n,)
-            Filtered alike [rad].
+            Joint positions, filtered alike [rad].
         dt : float
-            Since the last comparison [s].
+            Time since the last comparison [s].
         """
         if self._start is None:
             self._start, self._rows[strains.SLOW] = position.copy(), residual
@@ -170,6 +171,6 @@ def _at_rest(model, strain_map, q):
     return drive, load, to_strain @ terms.f2
 
 
-#: A correction below this fraction of the bound is none.
+#: A correction below this fraction of the bound counts as none.
 NOTHING = 1e-3
 NONE = np.zeros(0, int)
