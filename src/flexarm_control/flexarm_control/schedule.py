@@ -3,7 +3,7 @@ r"""Gains that change with the configuration: a weighted mean of several sets, e
 
 .. math::
     K(q) = \sum_k w_k(q)\,K_k, \qquad w_k = \frac{d_k^{-2}}{\sum_l d_l^{-2}}, \qquad
-    d_k^2 = \sum_j 4\sin^2\tfrac{q_j - q_{kj}}2,
+    d_k^2 = \sum_j 4\sin^2\tfrac{q_j - q_{kj}}2 .
 
 This is the interpolation of Shepard (1968): in the configuration of set k, K is K_k and its derivative is zero. The sum
 over j includes only joints that change the arm's equations; the first joint of a planar arm without gravity does not.

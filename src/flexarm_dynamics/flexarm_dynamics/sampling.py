@@ -8,7 +8,7 @@ e^{Ah}`, :math:`\Gamma(h) = \int_0^h e^{As}ds` and :math:`Q(h) = \int_0^h e^{As}
     \Phi(h_0 + e) = \Phi(e)\Phi(h_0), \quad \Gamma(h_0 + e) = \Gamma(h_0) + \Phi(h_0)\Gamma(e), \quad
     Q(h_0 + e) = \Phi(e)Q(h_0)\Phi(e)^T + Q(e),
 
-so steps over multiples :math:`h_0` of a short period g come from that over g by doubling, and are kept. The steps over
+so steps over multiples :math:`h_0` of a short period g come from the one over g by doubling, and are kept. Steps over
 the rest e, below g, and over g itself are Taylor series whose coefficients do not depend on e:
 
 .. math::
@@ -101,7 +101,7 @@ class Sampling:
         return out.reshape(count + 1, -1)
 
     def _multiple(self, k):
-        """The step over k short periods: twice the step over half of them, and one short step more if k is odd."""
+        """The step over k short periods: that over half of them, done twice, and one short step more if k is odd."""
         if k == 1:
             return self._short(self.grid)
         half = self._kept(k // 2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Reads messages from their bytes, and writes them, if their strings and lengths seldom change.
+r"""Reads and writes the bytes of messages whose strings and lengths seldom change.
 
 The middleware carries XCDR1 (OMG DDS-XTypes 1.3, section 7.4.1): four bytes of encapsulation, then the fields one after
 the other, each aligned to its own size, with a length before each string and array. On the control path only numbers

@@ -192,7 +192,7 @@ class Driver(ArmNode):
     def connect(self, torques):
         """Make the subscription of `joint_torque` the control path, and monitor its timeout."""
         self.make_control_path(torques)
-        # The torque ends also if the samples stop, too.
+        # The torque also ends if the samples stop.
         self.make_timer(self.gate.timeout / 2.0, self.watch)
 
     def now(self):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes declared parameters ROS parameters: descriptors, validation, and what changed."""
+"""Turns declared parameters into ROS parameters: descriptors, validation, and what changed."""
 
 import difflib
 

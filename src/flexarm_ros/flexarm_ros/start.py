@@ -48,8 +48,8 @@ def start(module):
 def leave(code):
     """End this process, whose nodes are destroyed and whose contexts are shut down, with an exit code.
 
-    The destructors of the middleware's libraries are not run. Under load, some three exits in a thousand, Fast DDS
-    corrupted its heap or hung in them after the interpreter had finished.
+    The destructors of the middleware's libraries are not run. Under load, in some three exits in a thousand,
+    Fast DDS corrupted its heap or hung in them after the interpreter had finished.
     """
     # Delete what still refers to a context: this also deletes the participant and its shared memory.
     gc.unfreeze()

@@ -2,7 +2,7 @@
 r"""Computes the safe action `damp`: how large the torque against a joint's velocity becomes, and how softly it begins.
 
 A drive without fresh torque takes its velocity loop to zero, :math:`-T(t)\tanh(\dot q/v_0)` with :math:`v_0` =
-`DAMP_SPEED`. A torque T decelerates a joint of inertia J by a = T/J. From a speed v it stops within the distance
+`DAMP_SPEED`. A torque T decelerates a joint of inertia J by a = T/J. From a speed v it stops within the angle
 
 .. math:: s \approx \tfrac12 v\,t_d + \frac{v^2}{2a},
 
@@ -13,7 +13,7 @@ seven times as far as the move that it ends. Therefore, for each joint:
   began. So a fast motion is stopped with more torque than a slow one, in proportion to its own: a move over 1 rad
   from rest to rest accelerates as much. T is at least `FRACTION` of, and at most, what the arm allows: the torque
   limit, and the torque that strains a gauge, by accelerating the rigid arm, to `OF_RANGE` of its full scale. The
-  largest torque that bears the arm's weight in any pose is added, within the torque limit. `damp_torque` in the arm
+  largest torque that the arm's weight needs in any pose is added, within the torque limit. `damp_torque` in the arm
   file replaces all of this.
 - It grows linearly within :math:`t_d`, half a period of the lowest bending mode with locked joints but at most
   `MAX_TIME`; `damp_time` in the arm file replaces it. The part that bears the weight acts at once, so the arm does not
@@ -33,7 +33,7 @@ from flexarm_dynamics.singular_perturbation import quasi_steady_state, slow_torq
 DAMP_SPEED = 0.05
 #: Where nothing bounds the torque, the rigid arm is stopped at this rate [1/s].
 DAMP_RATE = 10.0
-#: Distance within which a joint is stopped, without the soft start [rad].
+#: Angle within which a joint is stopped, not counting the soft start [rad].
 WAY = 0.35
 #: Minimum torque, as a fraction of what the arm allows; fraction of the gauges' full scale that it allows [-].
 FRACTION, OF_RANGE = 0.2, 0.5

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""A vector environment of gymnasium whose arms each learn to reach a joint configuration without swinging there.
 
-The observation of each arm is its full state, q, delta, qd, delta_d, and then the way that is left, g - q for the goal
-g. An action is the joints' torques divided by their limits. The reward of a step is
+The observation of each arm is its full state, q, delta, qd, delta_d, and then the remaining way, g - q for the goal g.
+An action is the joints' torques divided by their limits. The reward of a step is
 
 .. math:: -\sum_i|g_i - q_i| - |w|/L,
 
-with the tip's deflection w over the arm's reach L. An episode is terminated, with the penalty `LOST`, if the arm leaves
-the range of its model so far that its state is not finite. It is truncated after its time. The next step of that arm
-then begins a new episode, whatever the action (`AutoresetMode.NEXT_STEP`). Give a `reward` function of your own for
-other rewards and goals.
+with the deflection w of the last link's tip and the arm's reach L. An episode is terminated, with the reward `LOST`, if
+the arm leaves the range of its model so far that its state is not finite. It is truncated after its duration. The next
+step of that arm then begins a new episode, whatever the action (`AutoresetMode.NEXT_STEP`). Start and goal are random.
+For another reward, give a `reward` function.
 
 gymnasium is optional: ``pip install gymnasium``, or the wheel's extra ``gym``.
 """

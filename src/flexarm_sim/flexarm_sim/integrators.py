@@ -13,7 +13,7 @@ __all__ = [
 ]  # fmt: skip
 
 #: Largest product of an explicit method's substep and the rate at which friction damps a joint that reverses, and
-#: largest factor by which substeps are added for this: in longer substeps light joints hunt [-].
+#: largest factor by which this increases the number of substeps: in longer substeps light joints hunt [-].
 FRICTION_PER_STEP, MOST = 2.0, 16
 
 

@@ -114,7 +114,7 @@ def design(model, slow, fast, manifold=None, settings=None):
     fuller = modes.fuller(0, level != "file", level == FINITE_SLOPE)
     if modes is not model:
         seen += (shown(model, fuller),)
-    # The manifold of first-order kinematics: the regulator of the fuller arm follows it, and takes up the rest.
+    # The manifold keeps the file's kinematics: the regulator of the fuller arm follows it, and takes up the rest.
     known = None if fuller is model else model
     motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q, known))
     together = chosen["saturation"] == "together"

@@ -19,7 +19,7 @@ from flexarm_dynamics.linear import jacobian, linear_plant, sampled, state_at_re
 from ..component import at_rest
 from ..fast.none import NoFastLaw
 
-#: Allowance for rounding [1/s]: without a required margin, a design counts as unstable if a pole grows this fast.
+#: Allowance for rounding [1/s]: a pole may lie this far to the right of minus the margin.
 ROUNDING = 1e-6
 
 

@@ -8,7 +8,7 @@ Two jumps are made to fade (module `fading`):
 
 - A control that replaces another one adds to its slow torque the old control's torque minus its own at that sample. If
   it is for another payload, this difference fades within two periods of the lowest mode with locked joints, so that the
-  arm does not ring. At rest, the slow law's integral first takes as much of the difference as it can.
+  arm does not ring; if the reference also rests, the slow law's integral first takes as much of it as it can.
 - Without a feed-forward, slow torque and manifold jump where the reference changes to another polynomial with another
   jerk and snap. What the previous polynomial, continued, would give more is added. A feed-forward does this in its own
   motion.
@@ -88,7 +88,7 @@ class CompositeControl:
 
     @property
     def limit(self):
-        """Torque limit that the feed-forward keeps, shape (n,) [N m]; infinite: none."""
+        """Torque limit that the feed-forward keeps to, shape (n,) [N m]; infinite: none."""
         return self._limit
 
     @limit.setter
@@ -157,7 +157,8 @@ class CompositeControl:
         Returns
         -------
         ndarray, shape (n,)
-            u of (12) [N m]; before any limit. Overwritten by the next step.
+            u of (12) [N m], not clipped to the torque limit; with `together`, the feedback about a feed-forward is
+            already scaled to it. Overwritten by the next step.
         """
         before, self._before = self._before, None
         self._advance(reference, dt)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Optimal fast control with a gain scheduled over the workspace: the law of `lqr` where (11) changes with q.
+r"""Optimal fast control with a gain scheduled over the workspace: that of `lqr`, as (11) changes with q.
 
 Siciliano & Book (1986) solve (20) once, in the trajectory's end configuration. Here it is solved on a regular grid of
 joint configurations. The control path interpolates the gain multilinearly between them:
 
 .. math::
     u_f = K_f(q)\,z_f, \qquad
-    K_f(q) = \sum_{c} \Big[\prod_j w_{j}(c, q_j)\Big] K_c, \qquad w_j \in \{1-t_j,\; t_j\},
+    K_f(q) = \sum_{c} \Big[\prod_j w_{j}(c, q_j)\Big] K_c, \qquad w_j \in \{1-t_j,\; t_j\} .
 
 The sum runs over the 2^d corners c of the cell that contains q; t_j in [0, 1] is the place of q_j in the cell. The grid
 leaves out joints that do not change A2 and B2, such as the first joint of a planar arm or the yaw of an arm on a

@@ -280,7 +280,7 @@ class _Run:
     ----------
     state, torque : ndarray, shapes (2 (n + m),) and (n,)
     driven : ndarray, shape (n,)
-        The torque without Coulomb friction, which moves the arm [N m].
+        The torque minus Coulomb friction, that is, what moves the arm [N m].
     fading : Fading
         Jumps of (state, torque).
     source : _Source or None
@@ -317,7 +317,7 @@ class At:
         return state
 
     def around(self, step, out):
-        """Fill `out` (p, 3, n) with states at offsets `step` [s] apart from there, the middle one as of `near`."""
+        """Fill `out` (p, 3, n) with states as of `near`, at offsets `step` [s] apart; the middle one is 0."""
         around(self.path, self.stamp_ns, self._offset, step, out)
 
 

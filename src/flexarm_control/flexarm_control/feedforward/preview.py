@@ -59,8 +59,8 @@ FASTEST = 3.0
 #: Maximum number of rounds, and change of the shift after which there is no further round [rad]. The equations are
 #: linearised again if a change is more than this fraction of the one before it.
 ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
-#: A plan is not found if its last change was more than this [rad]. The search ends early if the change is still more
-#: than `SLOW` of the first one after this many rounds. The regulator takes up what a smaller change leaves.
+#: A plan is not found if its last change was more than this [rad]. The search for it ends early if, after this many
+#: rounds, the change is also still more than `SLOW` of the first one. The regulator takes up what a smaller one leaves.
 FOUND, HOPELESS = 0.02, 5
 #: Fraction of the torque limit that a plan aims at where it would take more, weight of the penalty beyond it, and
 #: maximum number of rounds with a penalty.
@@ -74,7 +74,7 @@ KNOTS, SMALL = (80, 400), 1e-6
 #: Weight of the shift's acceleration, over the square of the lowest bending frequency, relative to the shift.
 SMOOTHNESS = 0.01
 #: Phase of the fastest mode per step at which the fourth-order Runge-Kutta method is still stable, with a margin; and a
-#: smaller phase for motions that make that mode faster, so that the first is too large [rad].
+#: smaller phase for motions that make that mode faster, so that the first would be too large [rad].
 STABLE, STABLER = 1.5, 0.75
 #: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0

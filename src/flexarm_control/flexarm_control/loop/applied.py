@@ -114,7 +114,7 @@ class Applied:
         return max(self._other_for, self._unconfirmed_for)
 
     def _mismatch(self, reported):
-        """The joint whose reported torque is none of those sent; None if there is no such joint, or all are unknown."""
+        """The joint whose reported torque is none of those sent, or None; unknown torques are not judged."""
         tolerance, last = self._tolerance, self._sent[self._at]
         if tolerance is None or self._kernels.alike(reported, last, tolerance):
             return None

@@ -477,7 +477,7 @@ class ArmController:
         return self.enabled
 
     def _expect(self, path):
-        """Note the path that is followed now, or None; if its torque was checked, the arm can brake as it does."""
+        """Note the path that is followed, or None; if its torque was checked, its accelerations can brake the arm."""
         self._expected = path
         most = np.zeros(self.model.n_joints)
         if path is not None and np.isfinite(self.torque_allowed).all():
@@ -642,7 +642,8 @@ class ArmController:
     def _return(self, sample, since, keeps=False):
         """Let torque return in a ramp; the reference begins where the arm is, and brakes the arm if it moves.
 
-        `since` has the stamp [ns] and the positions (n,) [rad] of an earlier sample; None: there is no mean speed.
+        `since` has the stamp [ns] and the positions (n,) [rad] of an earlier sample, for the mean speed; None: the
+        mean speed is not used.
         """
         if not keeps:
             self._take_over(sample, since)

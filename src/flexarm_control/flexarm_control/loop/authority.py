@@ -37,8 +37,8 @@ PARAMETERS = (
         "Largest torque sent, per joint; 0.0: the arm file's limits.torque. Never above the arm file's."
     ),
     parameter("torque_rate_limit", [0.0], "N m/s", 0.0, NO_RATE, length="joints").described(
-        "Largest change of torque per second, relative to the last torque sent; 0.0: the arm file's limits.torque_rate;"
-        " 1e9: no limit."
+        "Largest change of torque per second, counted from the last torque sent; 0.0: the arm file's"
+        " limits.torque_rate; 1e9: no limit."
     ),
     parameter("return_time", 0.065, "s", 0.0, 10.0).described(
         "Time in which torque returns after an interruption, and at the start; 0.0: at once."

@@ -6,7 +6,7 @@ move with them. The modal rows of (2) along that motion,
 
 .. math:: M_{21}\ddot q_s + M_{22}\ddot\delta + f_2 + C_2\dot\delta + K_2\delta = 0,
 
-have one solution that does not vibrate. K_2 is of order 1/mu^2, so this solution is the limit of the iteration
+have one solution that does not vibrate. K_2 is of order 1/mu^2, so this solution follows from the fixed-point iteration
 
 .. math::
     \delta^{(0)} &= -K_2^{-1}(M_{21}\ddot q_s + f_2), \qquad \dot\delta^{(0)} = 0 \\
@@ -22,7 +22,7 @@ error is of order mu^(k+1). The joint rows of (2) give the torque with which the
 The derivatives are taken along the slow motion through the present state, by central differences over
 `expansion.step`. The reference is known, and under the slow law the tracking error decays by
 :math:`\ddot e = -k_v\dot e - k_p e`. So the manifold is valid off the reference, too, and the slow poles stay where
-they were placed. docs/control.md has the derivation, and compares with a manifold found numerically.
+they were placed. docs/theory.md has the derivation, docs/control.md the measured powers of mu.
 """
 
 import numpy as np

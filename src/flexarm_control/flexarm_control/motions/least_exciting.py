@@ -5,7 +5,7 @@ The joints go in a straight line of joint space, :math:`q = q_0 + \Delta\,\sigma
 degree five with rest and no jerk at both ends, whose coefficients x are found by a convex programme
 
 .. math:: \min_x\; \frac{w\,E(T) + \frac1T\int_0^T E\,dt}{E_5} + \epsilon\,\frac{\int\dddot\sigma^2dt}{J_5}
-    \quad\text{with}\quad |\bar u_i(t)| \le u_{i,max},\; 0 \le |\Delta_i|\,\dot\sigma(t) \le v_{i,max},
+    \quad\text{with}\quad |\bar u_i(t)| \le u_{i,max},\; 0 \le |\Delta_i|\,\dot\sigma(t) \le v_{i,max} .
 
 E is the energy of the deviation from the quasi-steady state that the fast subsystem (11) has along the motion. The
 deviation is linear in x (`excitation`). :math:`E_5, J_5` are those of a quintic of the same duration. The torque

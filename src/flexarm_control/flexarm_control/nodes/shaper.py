@@ -48,7 +48,7 @@ PARAMETERS = (
         "time_law", trajectory_shaper.GIVEN, choices=trajectory_shaper.TIME_LAWS, read_only=True
     ).described(
         "Time law of trajectories before they are shaped. given: that of their points; otherwise the quickest within "
-        "the limits, jerk_limited along a straight line, time_optimal through all points, which then need no times."
+        "the limits, jerk_limited along a straight line, time_optimal through all points; points then need no times."
     ),
     parameter("stream_output", "", read_only=True).described(
         "Topic to which the shaped stream goes, such as forward_position_controller/commands; empty: no streams."
@@ -64,7 +64,7 @@ PARAMETERS = (
         "Rate of the shaped stream."
     ),
     parameter("stream_timeout", 0.2, "s", 0.01, 60.0, read_only=True).described(
-        "Without inputs for this long, velocities become 0, and a constant stream is no longer published."
+        "Without inputs for this long, velocities become 0, and a stream at rest is no longer published."
     ),
 )
 #: Prefix of the parameters that may change at run time.

@@ -77,7 +77,7 @@ class MotionKalman(Kalman):
             "Unknown change of each joint's acceleration: root of the spectral density."
         ),
         parameter("acceleration_time", 0.1, "s", 1e-3, 1e3).described(
-            "Time constant in which a joint's acceleration is forgotten."
+            "Time constant with which a joint's acceleration is forgotten."
         ),
         parameter(
             "bending_force_noise", [0.1], "N s^0.5, N m s^0.5", 0.0, 1e6, length="modes"
@@ -89,7 +89,8 @@ class MotionKalman(Kalman):
             "Random walk of the bias, per root of a second, or the arm file's drift if that is larger."
         ),
         parameter("innovation_order", 0, "-", 0, 64).described(
-            "Number of past innovations of all gauges that also predict strains, as learnt online; 0: none."
+            "Number of past innovations of all gauges from which strains are also predicted, with coefficients that"
+            " are learnt online; 0: none."
         ),
     )
 
@@ -229,7 +230,7 @@ class MotionKalman(Kalman):
         return self._C @ x
 
     def _innovations(self, innovation):
-        """Publish the innovation of a sample; a gauge that is left out has none."""
+        """Set the strains' innovation and error of a sample, and learn from it; a gauge that is left out has none."""
         innovation[[self._n + i for i in self._out]] = 0.0
         self.strain_innovation[:] = innovation[self._n :]
         self.strain_innovation[list(self._out)] = np.nan
@@ -319,7 +320,7 @@ class PrescribedMotion(Motion):
 
     def _design(self, dt, *q):
         step = super()._design(dt, *q)
-        # The shared noise changes by sample, however long a sample takes.
+        # The shared noise changes from sample to sample, however long the time between them.
         last = slice(self._moving + self._gauges, self.size)
         Phi, Q = step.Phi.copy(), step.Q.copy()
         Phi[last, last] = self._companion

@@ -43,8 +43,8 @@ OFF, REST, ONLINE = "off", "rest", "online"
 PARAMETERS = (
     parameter("payload_estimate", OFF, choices=(OFF, REST, ONLINE), read_only=True).described(
         "Whether the payload is estimated from strains and torques. rest: while the arm rests under gravity; online:"
-        " also in motion. The control takes the estimate over at rest, if the arm file's payload is outside its"
-        " interval."
+        " also in motion. The control takes the estimate over at rest, if the payload that it is designed for is"
+        " outside the estimate's interval."
     ),
     parameter("payload_limit", 1.0 + TOLERANCE, "-", 1.0, 100.0, read_only=True).described(
         "Largest payload that is accepted, as a multiple of the arm file's: observer.payload_tolerance plus one."
@@ -53,7 +53,7 @@ PARAMETERS = (
 
 #: Fractions by which links may be stiffer and drives stronger than in the arm file [-].
 STIFFNESS, DRIVE = 0.15, 0.05
-#: Unmodelled friction, of the torque limit; and of the file's Coulomb friction, at rest and in motion [-].
+#: Unmodelled friction, in parts of the torque limit, and of the file's Coulomb friction at rest and in motion [-].
 UNSTATED, STICKING, SLIDING = 0.01, 1.0, 0.3
 #: Time between two evaluations [s], and time constants of the sums, in the time in which they grow [s].
 INTERVAL, MEMORY = 0.008, {REST: 1.0, ONLINE: 3.0}

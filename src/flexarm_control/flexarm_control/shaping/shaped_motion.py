@@ -25,7 +25,8 @@ later commands. The less a frequency changes within a period, the less vibration
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-#: Number of places per period of the lowest mode at which changing frequencies are evaluated, and a motion is written.
+#: Number of places per period of the lowest mode at which changing frequencies are evaluated, and at which a motion is
+#: written that points at its knots alone do not give.
 PER_PERIOD = 32
 #: Knots closer to each other than this count as one [s].
 SAME = 2e-6

@@ -59,7 +59,7 @@ COUPLED, COUPLED_FACTORS = 10.0, 3
 ROUNDS = 3
 #: A motion is straight if it stays this close to its line, over its length [-].
 STRAIGHT = 1e-4
-#: Time for a stop over what the largest acceleration needs, beside `modes.periods`; factor if it must be longer.
+#: Time for a stop over what the largest acceleration needs, plus `modes.periods`; factor if it must be longer.
 STOP, LONGER = 1.3, 1.3
 #: Within the limits, a stop may accelerate this many times as much as the motion does [-].
 HARDER = 1.3
@@ -266,7 +266,7 @@ class Line:
         return [np.abs(values[:, 0]) for values in self.left(progress, steps, bend[:, None])]
 
     def left(self, progress, steps, parts):
-        """Amplitudes that accelerations (k, p) in cells of durations `steps` leave, list of (factors, p) by mode."""
+        """Complex amplitudes that accelerations (k, p) in cells of durations `steps` leave: by mode, (factors, p)."""
         sizes, turns = self._turning(progress, steps)
         found = []
         for size, turn in zip(sizes.T, turns.T, strict=True):
@@ -365,7 +365,7 @@ class Law:
         return PiecewiseMotion.through(given.knots[0] + slower * self.nodes, made[: given.fields])
 
     def left(self, x, line):
-        """Amplitude that each acceleration of x leaves of each mode of a `line`, on the motion by x, (m, N - 1)."""
+        """Complex amplitude that each acceleration of x leaves of a `line`'s modes, on the motion by x, (m, N - 1)."""
         found = line.left(self._middle_progress(x), self._steps, self._parts)
         return np.array([values[FACTORS // 2, 1:] for values in found])
 

@@ -76,7 +76,7 @@ class AdaptiveModelFollowing(SlowLaw):
             "Upper bound of adaptive model following's payload estimate, as a multiple of the arm file's payload."
         ),
         parameter("dead_zone", 0.02, "rad/s", 0.0, 10.0).described(
-            "Adaptive model following ignores a combined error s below this value, such as bending and noise cause."
+            "Adaptive model following does not adapt to a combined error s below this, such as bending and noise cause."
         ),
     )
 

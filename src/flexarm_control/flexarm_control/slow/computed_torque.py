@@ -3,7 +3,7 @@ r"""Computed torque with an integral, on the slow subsystem (10) of Siciliano & 
 
 .. math::
     \bar u = B^{-1}(x_c)\,[\ddot q_{ref} + k_v\dot e + k_p e + w - a(x_c)], \qquad
-    \dot w = k_i e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q,
+    \dot w = k_i e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q .
 
 This is the inverse dynamics of the rigid arm (a contains Coriolis, gravity and friction terms) with feedback (Luh,
 Walker & Paul 1980; Sciavicco & Siciliano, *Modelling and control of robot manipulators*, ch. 6). With ``ki = 0`` and
@@ -13,8 +13,9 @@ Walker & Paul 1980; Sciavicco & Siciliano, *Modelling and control of robot manip
   The loop is stable for ki < kp kv (Routh). w stops at its limit. While the slow torque is beyond a joint's limit, w
   does not grow in that direction.
 - a and B are taken at x_c. This is the measured state or, with ``feedforward_at: reference``, the reference
-  (q_ref, qd_ref). Then no noise of measured speeds is fed back through Coulomb friction and Coriolis terms. They are
-  cancelled to first order in the error only; the gains must do the rest.
+  (q_ref, qd_ref). With the reference, no noise of measured speeds is fed back through Coulomb friction and Coriolis
+  terms. But the terms are then cancelled only where the error is zero. A remainder of first order in the error is left
+  to the gains.
 
 The law assumes that a and B are known up to a slowly varying torque. Its error dynamics are linear with ``state`` only.
 """

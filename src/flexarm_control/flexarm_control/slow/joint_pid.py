@@ -3,7 +3,7 @@ r"""PID feedback of each joint about the rigid arm's torque on the reference.
 
 .. math::
     \bar u = B^{-1}(x_{ref})\,[\ddot q_{ref} - a(x_{ref})] + K_q e + K_{\dot q}\dot e + w, \qquad
-    \dot w = K_w e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q,
+    \dot w = K_w e, \quad |w| \le w_{max}, \qquad e = q_{ref} - q .
 
 The feedback passes a low-pass filter (`flexarm_control.low_pass`).
 
@@ -17,7 +17,7 @@ Friction holds a joint whose error is small. The integral moves it on only slowl
 than the friction is not damped. So a fraction :math:`\gamma` of the arm file's Coulomb friction is added without the
 low-pass filter, minus the friction of the motion, which :math:`\bar u` already contains:
 
-.. math:: u_f = \gamma\,f_c\,[\tanh((\dot q + \lambda e)/v_s) - \tanh(\dot q_{ref}/v_s)] .
+.. math:: u_f = \gamma\,f_c\,[\tanh((\dot q + \lambda e)/v_0) - \tanh(\dot q_{ref}/v_0)] .
 
 A joint that sticks beside its reference is pushed back as if it moved there at the speed :math:`\lambda e`. Without
 that it creeps, and the integral grows until the joint breaks loose. With :math:`\gamma` below 1 some friction remains,
@@ -30,7 +30,7 @@ fraction :math:`\beta` of the friction, minus what is already cancelled, is adde
 where it sticks at the speed :math:`\lambda_\beta e`:
 
 .. math:: u_b = \max(\beta - \gamma, 0)\,f_c
-    \,[\tanh((\dot q_{ref} + \lambda_\beta e)/v_s) - \tanh(\dot q_{ref}/v_s)] .
+    \,[\tanh((\dot q_{ref} + \lambda_\beta e)/v_0) - \tanh(\dot q_{ref}/v_0)] .
 
 The friction itself damps this torque: at an amplitude and frequency at which the torque acts as a stiffness k, the
 friction acts as a damper of at least :math:`k/\omega`. Linear loops are judged without these two torques; `flexarm
@@ -81,8 +81,8 @@ class JointPid(SlowLaw):
             "Largest torque of joint_pid's integral; 0.0: the torque limit."
         ),
         parameter("friction", [0.0], "-", 0.0, 1.0, length="joints").described(
-            "Fraction of the arm file's Coulomb friction that joint_pid cancels where a joint deviates from its motion;"
-            " a joint with less friction than that fraction may hunt."
+            "Fraction of the arm file's Coulomb friction that joint_pid cancels where a joint moves differently from"
+            " its motion; a joint with less friction than that fraction may hunt."
         ),
         parameter("return_rate", 0.0, "1/s", 0.0, 1e4).described(
             "For joint_pid's friction cancellation, a joint's error times this is added to its speed, so that a joint"
@@ -93,7 +93,7 @@ class JointPid(SlowLaw):
             " joint sticks beside its reference."
         ),
         parameter("breakaway_rate", 0.0, "1/s", 0.0, 1e4).described(
-            "Speed per error at which breakaway takes a joint to go back from where it sticks."
+            "Speed per error at which a joint is assumed to go back from where it sticks, for breakaway."
         ),
         SCHEDULE,
         BANDWIDTH,

@@ -4,7 +4,7 @@ r"""Model following with compensation, the general form (13)-(14) of Siciliano &
 .. math::
     \bar u &= B^\dagger(\bar x)\,[-a(\bar x) + v], \qquad
     v = \Lambda_0 q + \Lambda_1\dot q + \hat u, \\
-    \hat u &= \ddot\theta_{ref} - \Lambda_0\theta_{ref} - \Lambda_1\dot\theta_{ref},
+    \hat u &= \ddot\theta_{ref} - \Lambda_0\theta_{ref} - \Lambda_1\dot\theta_{ref} .
 
 The last line is the inverse of the reference model (14). The slow subsystem (10) then follows the
 reference perfectly: the error obeys e'' = Lambda_1 e' + Lambda_0 e, with Lambda_0 = -diag(kp) and

@@ -4,7 +4,7 @@ r"""Resolved acceleration control (Luh, Walker & Paul 1980) of the tip, on the s
 .. math::
     \bar u &= B^{-1}(\bar x)\,[y - a(\bar x)], \\
     b &= \ddot x_{ref} + \kappa_v(\dot x_{ref} - \dot x) + \kappa_p(x_{ref} - x) - \dot J\dot q, \\
-    y &= y_0 + J^{*}(b - J y_0), \qquad y_0 = \ddot q_{ref} + k_v\dot e + k_p e,
+    y &= y_0 + J^{*}(b - J y_0), \qquad y_0 = \ddot q_{ref} + k_v\dot e + k_p e .
 
 Here x is the tip of the straight arm and J (3, n) the Jacobian of its position. x_ref and its derivatives follow from
 the joints' reference by the same kinematics. Where J has full rank, the tip's error obeys

@@ -52,7 +52,7 @@ class SlidingMode(SlowLaw):
             "Bound of the relative error of the inertia, for sliding mode: largest row sum of B' B^-1 - 1."
         ),
         parameter("boundary_layer", [0.4], "rad/s", 1e-6, 1e3, length="joints").described(
-            "Half width of the boundary layer, in which sliding mode is linear."
+            "Half width of the boundary layer around the sliding surface, in which sliding mode is linear."
         ),
     )
 

@@ -228,7 +228,7 @@ class ReferenceGenerator:
         return verdict
 
     def ahead(self, trajectory):
-        """The trajectory as it is followed: continuous joints go the short way, one that is joined is cut.
+        """The trajectory as it is followed: continuous joints go the short way; a joined one loses its past points.
 
         A trajectory that is joined (see `joins`) starts now, with fewer points. An arm that is not on its path, within
         the tolerance of a start, has at least the lowest mode's period to get there; nearer points are left out, except
@@ -465,7 +465,7 @@ class ReferenceGenerator:
         return out
 
     def scale(self, factor, deceleration=GENTLE, given=True):
-        """Scale the time of trajectories by a factor from 0 to 1 from now on; see module `scaling`.
+        """Let the time of trajectories go at a factor from 0 to 1 from now on; see module `scaling`.
 
         A trajectory that is followed changes to the factor within the time of a `stop`. Stops are not scaled.
 

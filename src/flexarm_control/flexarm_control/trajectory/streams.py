@@ -14,7 +14,7 @@ Velocity and acceleration have no step, and the jerk has none at the end.
 Positions alone are joined by straight lines, whose velocity steps at each point. If points are nearer to each other
 than a window W, the straight lines L are smoothed by a triangle of that width,
 
-.. math:: q(t) = \frac{F(t + W/2) - 2F(t) + F(t - W/2)}{(W/2)^2}, \qquad F'' = L,
+.. math:: q(t) = \frac{F(t + W/2) - 2F(t) + F(t - W/2)}{(W/2)^2}, \qquad F'' = L .
 
 Its velocity and acceleration are the same differences of F' and of L. The motion reaches the end, at rest, W/2 later. A
 single point is reached at rest after W, if its time is shorter; sent again and again, it acts as a filter of third

@@ -72,7 +72,7 @@ class Transmission:
 
     stiffness: float  # [N m/rad] k
     damping: float = 0.0  # [N m s/rad] d
-    play: float = 0.0  # [rad] b: angle by which the link moves freely while the motor is held
+    play: float = 0.0  # [rad] b: whole angle by which the link moves freely, with the motor held
     load_damping: float = 0.0  # [s/rad] c
     rounding: float = 0.0  # [rad] w
     play_damping: float = 0.0  # [N m s/rad] d_0

@@ -285,7 +285,7 @@ class _Writer:
         ET.SubElement(joint, "origin", xyz=_text(*xyz))
 
     def _limits(self, joint):
-        """The limits of the arm file; a joint without position limits is continuous, other missing limits are large."""
+        """Limits of the arm file; a joint without both position limits is continuous, other missing ones are large."""
         limits, element = joint.limits, self.last
         low, high = limits.position
         given = {

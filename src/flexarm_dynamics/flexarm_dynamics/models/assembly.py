@@ -428,7 +428,7 @@ def assemble(arm, shapes, loads):
     return data
 
 
-#: Constants of reduced links by the names of their arrays; the level of first order leaves out the second order.
+#: Constants of reduced links by the names of their arrays; those of the second order are left out at `first_order`.
 _REDUCED = {
     "red_C": "translation", "red_l": "rotation", "red_H": "first", "red_G": "second",
     "red_T": "tip_translation", "red_R": "tip_rotation",

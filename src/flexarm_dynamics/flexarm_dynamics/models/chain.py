@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""The general model: arms with any number of rigid or flexible links, evaluated by `kernels.chain`.
 
-Every link is a uniform beam along its frame's x axis, which bends (Euler-Bernoulli, no rotary inertia of the
-sections in bending) and twists (with the sections' polar inertia) in the assumed modes of the arm file:
-:math:`y(x,t)=\sum_i\phi_i(x/L)\delta_i(t)`. The mass matrix depends on the deflections; nothing of the
-Lagrangian is left out at the arm's `level`:
+A link is a beam along its frame's x axis, uniform or with sections that change along it. It bends (Euler-Bernoulli, no
+rotary inertia of the sections in bending) and twists (with the sections' polar inertia) in the assumed modes of the arm
+file: :math:`y(x,t)=\sum_i\phi_i(x/L)\delta_i(t)`. A link can also be given by reduced matrices, with modes of their own
+(`arm.reduced`). The mass matrix depends on the deflections; nothing of the Lagrangian is left out at the arm's `level`:
 
 - first order: displacements are linear in delta, the tip turns by its slopes (y' about z, -z' about y, twist);
 - `foreshortening`: the axis keeps its length to second order, so that a spinning link is stiffer;
@@ -460,7 +460,7 @@ class Chain(ArmModel):
     # Kinematics --------------------------------------------------------------------------------
 
     def frames(self, q, delta=None):
-        """Orientation and origin of each link's base frame, and at the end of the tip frame, in the base frame.
+        """Orientation and origin of each link's base frame and, last, of the tip frame, in the base frame.
 
         Returns
         -------

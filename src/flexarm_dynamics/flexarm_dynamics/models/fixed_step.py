@@ -16,7 +16,7 @@ from .model import Tableau
 _STAGES = DOP853.n_stages
 
 #: Two explicit Runge-Kutta methods, of order 8 and 4, and a linearly implicit one of order 2
-#: (`kernels.implicit_steps.implicit_step`). At rest, the latter stays stable however stiff the highest modes are; the
+#: (`kernels.implicit_steps.implicit_step`). At rest, the last one stays stable however stiff the highest modes are; the
 #: stiffness that a motion's loads add to a bent arm is treated explicitly.
 METHODS = {
     "dop853": Tableau(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Computes mode shapes of a beam that is clamped at its base, has a varying section and carries rigid bodies.
 
-Rayleigh-Ritz solves the beam problem of :math:`EI(\xi)`, :math:`m(\xi)`. Between two places where the section jumps or
-a body sits, a shape is a polynomial. Value and slope are continuous where two polynomials meet. So the curvature may
-jump where EI does, and the shear force at a body. In bending the trial functions of one span are
+The Rayleigh-Ritz method solves the beam problem of :math:`EI(\xi)`, :math:`m(\xi)`. Between two places where the
+section jumps or a body sits, a shape is a polynomial. Value and slope are continuous where two polynomials meet. So the
+curvature may jump where EI does, and the shear force at a body. In bending the trial functions of one span are
 
 .. math:: H_1 \ldots H_4, \qquad B_k(s) = \int\!\!\int P_k, \quad k = 2, 3, \ldots
 
@@ -166,7 +166,7 @@ class BeamProblem:
         degrees = self._degrees(modes)
         degree = max(degrees)
         K, M, rows = self._matrices(degrees)
-        # The largest mu of M v = mu K v belong to the lowest modes, which so keep all digits.
+        # The largest mu of M v = mu K v belong to the lowest modes, so these keep all digits.
         _, vectors = eigh(M, K, subset_by_index=(len(M) - modes, len(M) - 1))
         vectors = vectors[:, ::-1]
         coefficients = np.zeros((len(degrees), degree + 1, modes))
@@ -184,7 +184,7 @@ class BeamProblem:
         return [min(MAX_DEGREE, int(np.ceil(p))) for p in wanted]
 
     def _scaled_trial(self, span, degree):
-        """Trial functions of a span, with slopes by xi."""
+        """Trial functions of a span, whose slopes at its ends are derivatives by xi."""
         trial = _trial(degree, self.twist)
         if self.twist:
             return trial

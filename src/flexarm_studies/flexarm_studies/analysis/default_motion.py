@@ -10,8 +10,8 @@ from flexarm_dynamics.linear import static_torque
 
 #: The motion of the paper; it is taken if the arm can do it.
 PAPER = "paper"
-#: First turn of a joint [rad], and first duration [s]; number of durations, each twice the last, and of turns, each
-#: half the last.
+#: Largest turn of a joint [rad], which is tried first, and first duration [s]; number of durations, each twice the one
+#: before, and of turns, each half the one before.
 TURN, DURATION, LONGER, SHORTER = 1.0, 2.0, 4, 5
 #: Number of points of a motion that are checked, number of places at which the arm must be able to rest, and fraction
 #: of the torque limit that its weight may take there [-].

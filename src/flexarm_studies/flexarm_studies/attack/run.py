@@ -11,7 +11,7 @@ A run is compared with the run of the same case without a lie, `Honest`, whose m
   whose jerk jumps changes its torque most there, and so does a run that is stopped after it. Steps of the motion beyond
   `KICK` of the torque limit do not enlarge the scale;
 - *outlier*: distance of the torque from that of the honest run, as a fraction of its limit; if that is too large, minus
-  the distance that only another noise of the sensors causes;
+  the distance that other noise of the sensors alone causes;
 - *returning*: the largest torque in the first `SOON` after an interruption, minus the torque that holds the arm against
   gravity, as a fraction of its limit;
 - *silent*: time for which a torque acts without a new sample [s];
@@ -52,9 +52,10 @@ SWINGS = 3.0
 #: Largest speed of a quintic motion over its mean speed [-].
 QUINTIC = 1.875
 
-#: Tolerance for a measure that may reach its criterion.
+#: Relative tolerance, because a measure may be equal to its criterion [-].
 ROUNDING = 1e-9
-#: Largest permissible value of each measure; `OF_KIND` has the measures for each kind of lie.
+#: Largest permissible value of each measure, in the units of the module; those with "stop" are for lies of kind STOP.
+#: `OF_KIND` has the measures of each kind.
 CRITERIA = {
     "speed": 1.5,
     "strain": 2.0,
@@ -152,7 +153,7 @@ def drive(
     Raises
     ------
     FlexarmError
-        If the arm without a lie does not rest, or refuses the motion.
+        If the motion is refused, for example because the arm does not rest before it.
     """
     loop, scenario, rows, texts = driver.loop, driver.scenario, [], []
     plant, events = loop.simulator.plant, list(events)

@@ -70,9 +70,9 @@ class Setup:
     controller : dict
         Flat parameters, as `Scenario.controller`.
     law : callable or None
-        Makes the law that replaces the composite control from the arm's model.
+        Makes, from the arm's model, the law that replaces the composite control.
     motion : callable or None
-        Makes the trajectory that is sent in place of the motion from the arm's model.
+        Makes, from the arm's model, the trajectory that is sent in place of the motion.
     found : dict
         Properties of its design, stored with every run: plain data.
     """

@@ -2,10 +2,10 @@
 """What could still be explained of the strains that a model leaves: by the joints' motion, by currents, by gauges.
 
 ``python -m flexarm_studies.identification.left_over exp1.csv tudor --mapping tudor --gauge eps31 --fit 14:60 --score
-60:80 --band 8:21`` fits what belongs to the recording, while the arm is held. It regresses the residual of a gauge, in
-a band of frequencies, on sets of signals at many lags (`ridge`). This linear model is as large as the fitted part
-allows. If even this explains nothing, no model of that input does that is linear, or linear for each side of the gears'
-play.
+60:80 --band 8:21`` fits what belongs to the recording, while the arm's parameters are held. It regresses the residual
+of a gauge, in a band of frequencies, on sets of signals at many lags (`ridge`). This linear model is as large as the
+fitted part allows. If even this explains nothing, no model of that input does that is linear, or linear for each side
+of the gears' play.
 """
 
 import argparse

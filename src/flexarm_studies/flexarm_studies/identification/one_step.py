@@ -61,7 +61,10 @@ def filter_errors(arm, parameters, run, learnt):
 
 
 def regression_errors(strain, fitted, order):
-    """As `filter_errors`, by an autoregression of `order` of `strain` (s, g), fitted to the first `fitted` samples."""
+    """Measured minus predicted `strain`, shape (s, g), by an autoregression.
+
+    The autoregression has the `order` given and is fitted to the first `fitted` samples.
+    """
     count = len(strain) - order
     past = [strain[order - 1 - k : order - 1 - k + count] for k in range(order)]
     past = np.hstack([*past, np.ones((count, 1))])

@@ -40,7 +40,7 @@ def explained(measured, predicted, part, period, above):
     Parameters
     ----------
     measured, predicted : ndarray, shape (s, g)
-        Strains [-]; samples that were not measured are left out, but not for the score above the frequency.
+        Strains [-]. Samples that were not measured are left out; for ``vaf_above``, straight lines replace them.
     part : slice
     period : float
         Time between samples [s].
@@ -160,7 +160,7 @@ def ring_downs(recording, predicted, noise):
 
 
 def whiteness(error):
-    """Correlation of residuals (s,) between successive samples, and the bound that 95 % of white ones keep."""
+    """Correlation of residuals (s,) between successive samples, and its 95 % bound for white residuals."""
     e = error[np.isfinite(error)]
     e = e - e.mean()
     return float(e[1:] @ e[:-1] / max(e @ e, 1e-300)), 1.959964 / np.sqrt(max(e.size, 1))

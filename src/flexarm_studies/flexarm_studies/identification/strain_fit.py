@@ -7,7 +7,7 @@ With residuals :math:`e_k = \varepsilon_k - \hat\varepsilon_k(\theta)` of `presc
     \min_\theta \sum_k \bigl|L^{-1}(e_k - \rho\,e_{k-1})\bigr|^2, \qquad
     LL^T = \mathrm{Cov}(e_k - \rho\,e_{k-1}),
 
-with a wide prior about the file's values. These are generalised least squares with an autoregression :math:`\rho` of
+with a wide prior about the file's values. This is generalised least squares with an autoregression :math:`\rho` of
 each gauge and a covariance between the gauges, both from the residuals (Ljung, System Identification, 1999, 7.4). The
 residuals are slow if the model lacks friction, and the same in all gauges if these share a source of noise. Without the
 weights, the slow part would hide the vibration, and noise that a comparison of gauges removes would count as noise of
@@ -49,9 +49,9 @@ HELD = ("links[*].mass_per_length", "gauges[*].position")
 STEP = 1e-7
 #: Autoregression of the residuals before they are known [-], and their size, as a fraction of the signal [-].
 FIRST_MEMORY, FIRST_NOISE = 0.9, 0.02
-#: Residuals are assumed to last at most this long [s], even if they last longer: with an autoregression of one, the
-#: level of a gauge would have no effect. An autoregression smaller than the true one acts like any filter of the
-#: residuals: the values are still consistent, and the intervals allow for the remaining colour.
+#: Longest correlation time of the residuals that is assumed [s], even if the true one is longer: with an
+#: autoregression of one, the level of a gauge would have no effect. An autoregression smaller than the true one acts
+#: like any filter of the residuals: the values are still consistent, and the intervals allow for the remaining colour.
 MAX_MEMORY_TIME = 0.5
 #: Number of starts, and range of factors of stiffness and play from the second one on.
 STARTS, RANGE = 6, (0.6, 1.7)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists what strains under a prescribed motion can determine: numbers of the arm file, and how it was recorded.
+"""Lists what strains under a prescribed motion can determine: numbers of the arm file and of the recording.
 
 In addition to those of `quantities`, these are the parts of transmissions, what moves with the joints, and the
 positions of gauges. For the recording alone there are the error of a joint's zero angle, and each channel's delay and

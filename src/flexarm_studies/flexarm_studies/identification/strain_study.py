@@ -103,7 +103,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
 
 
 def _begin(recording, start):
-    """Beginning of the prediction: at the `start` [s] if the joints stand there, otherwise at rest before it."""
+    """Beginning of the prediction: at the `start` [s] or the last rest before it; `LEAD` before it without a rest."""
     still = rest.still(recording)
     row = min(max(round((start - recording.start) / recording.period), 0), len(still) - 1)
     before = max(row - round(LEAD / recording.period), 0)

@@ -360,7 +360,7 @@ class _ProfileReference:
 
 
 def continuous_loop(model, law, profile, times):
-    """The composite loop in continuous time, with full state and error control, as in the paper's simulations.
+    """The composite loop in continuous time with full state, integrated with error control, as in the paper.
 
     Parameters
     ----------

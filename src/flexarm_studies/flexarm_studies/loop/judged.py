@@ -10,7 +10,10 @@ from flexarm_dynamics.errors import FlexarmError
 
 
 def judge_of(loop, places, delay):
-    """The `Judge` of a `ClosedLoop` at rest in the `places` (k, n) [rad], with a `delay` [s]; it uses the loop up."""
+    """The `Judge` of a `ClosedLoop` at rest in the `places` (k, n) [rad], with a `delay` [s].
+
+    This runs the loop's law and observer; reset both before the loop is used again.
+    """
     source = Source(*loop.source)
     period, law = 1e-9 * loop.simulator.period_ns, loop.controller.law
     controllers = [linear_controller(law, loop.observer, q, period, source) for q in places]

@@ -270,7 +270,7 @@ def _smallest_residual(rows):
 
 
 def _share(right):
-    """Count of true values among all, in words; None if there are none."""
+    """Count of true values among all, in words; None for an empty list."""
     if not right:
         return None
     count = sum(map(bool, right))

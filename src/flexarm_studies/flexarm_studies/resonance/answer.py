@@ -99,11 +99,12 @@ def answers(found, windows, families, motion, begin):
     Returns
     -------
     list of Answer
-        All for the channel with the smallest scatter, sorted by sensitivity.
+        One per joint, all of the channel that has the answer with the smallest scatter; the largest sensitivity first.
+        Empty if the mode rang after no step.
     """
     main = max(families, key=lambda family: family.part)
     rung = {i: mode for mode, i in zip(main.modes, main.windows, strict=True)}
-    parts = {}  # for each joint: (response to the step over beta, amplitude) in its windows
+    parts = {}  # for each joint, by window: (response to the step for a beta of 1, amplitude)
     last, before = 0.0, None
     for first, end, joint in motion.free:
         number = _window(windows, begin + first, begin + end)
@@ -147,7 +148,7 @@ def _amplitude(found, window, mode):
 
 
 def _step(pole, motion, joint, first, last, at):
-    """Response to a motion of a joint from `first` to `last` at a time `at`, for a beta of 1 [rad s]."""
+    """Response at the time `at` to the motion of a joint from time `first` to `last`, for a beta of 1 [rad s]."""
     step = (last - first) / CELLS
     time = first + step * (np.arange(CELLS) + 0.5)
     speed = motion.derivative(1, time)[:, joint]

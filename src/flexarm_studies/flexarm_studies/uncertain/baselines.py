@@ -146,7 +146,7 @@ class Task:
 
     @cached_property
     def plants(self):
-        """The uncertain set: each a `Linear`, place by place."""
+        """The uncertain set: a `Linear` for each model at each of the places, model by model."""
         return [linear(each, q) for each in self.models for q in self.places]
 
     @cached_property

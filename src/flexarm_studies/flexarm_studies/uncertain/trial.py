@@ -9,13 +9,13 @@ Joint errors and vibration are errors. The tip is settled when it is within `TOL
 and stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`.
 
 Integration: dop853 is used if a few substeps are short enough for the highest mode and for the friction of light hubs.
-Friction damps a joint that reverses at the rate :math:`f_cH/v_s`, with the inverse H of the mass matrix. Otherwise the
-implicit method is used in substeps of `STEP`. The phase of a mode of 625 Hz changes by 0.1 rad in one substep; the
-method removes faster modes, like the current loop of a drive. An explicit method would take a hundred substeps per
-sample for these, and a day for the table. The steps are shorter if Coulomb friction would move a light hub farther than
-`KICK` in one, because friction reverses only at the end of a step. In longer steps, joints that come to rest hunt: one
-by 0.25 deg in implicit steps of 0.25 ms, but not in steps of 0.18 ms; another one by 0.09 deg in steps of 2 ms of
-dop853, by 0.04 deg in steps of 1 ms, but not in steps of 0.67 ms.
+Friction damps a joint that reverses at the rate :math:`f_cH/v_0`, with the inverse H of the mass matrix and the
+smoothing speed v_0 (`description.Friction`). Otherwise the implicit method is used in substeps of `STEP`. The phase of
+a mode of 625 Hz changes by 0.1 rad in one substep; the method removes faster modes, like the current loop of a drive.
+An explicit method would take a hundred substeps per sample for these, and a day for the table. The steps are shorter if
+Coulomb friction would move a light hub farther than `KICK` in one, because friction reverses only at the end of a step.
+In longer steps, joints that come to rest hunt: one by 0.25 deg in implicit steps of 0.25 ms, but not in steps of 0.18
+ms; another one by 0.09 deg in steps of 2 ms of dop853, by 0.04 deg in steps of 1 ms, but not in steps of 0.67 ms.
 
 The implicit method treats the stiffness that the loads of a motion add to a bent arm explicitly. If its steps are too
 long, a fast mode that should decay grows. Such an arm is lost by the method and not by its control. So a lost run is

@@ -16,7 +16,7 @@ AFTER = 8.0
 
 
 def draw(path, seed=0):
-    """Draw the second motion of one link with its payload into the file `path`. Durations by `seed`."""
+    """Draw the tip of one link with its payload in its second motion, durations by `seed`; return the file `path`."""
     case = cases.payload(1.0, seed)
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
     motion = case.motions[1]

@@ -96,7 +96,7 @@ def measured(arm, at, way, period) -> Measured:
     ----------
     arm : PositionArm
     at, way : (n,) ndarrays
-        End of the kick, and its direction [rad].
+        End of the kick, and the way of which it is the last part, `KICK` [rad].
     period : float
         Approximate period of the lowest mode [s].
     """
@@ -335,7 +335,7 @@ def run_bent(case):
         if motion.start.size == 1:
             continue
         given = bent(motion)
-        # Directions of the path at its end and at its start, as long as the way.
+        # Ways of the kicks, as long as the motion's way: forwards to the path's end, and backwards to its start.
         first, last = (given.position(t * given.duration) for t in np.array([[0.1], [0.9]]))
         size = np.linalg.norm(motion.angle)
         ways = [

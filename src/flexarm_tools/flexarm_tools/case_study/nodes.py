@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the case study with simulator, observer and controller as three processes over DDS."""
+"""Makes a run of the case study with simulator, observer and controller as three processes over DDS."""
 
 import shutil
 

@@ -107,7 +107,7 @@ def _page(found, run, shown, result):
 
 
 def _places(channel):
-    """Decimals with which a channel is written: about 10^-5 of its range."""
+    """Decimals with which a channel is written: about 10^-5 of its largest size."""
     size = np.nanmax(np.abs(channel["measured"]), initial=1e-9)
     return int(np.clip(5 - np.floor(np.log10(size)), 0, 8))
 

@@ -15,7 +15,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
-#: What states a larger length than this is not a record [bytes].
+#: Largest length that a record may state; reading ends at a larger one [bytes].
 MAX_LENGTH = 1 << 31
 
 

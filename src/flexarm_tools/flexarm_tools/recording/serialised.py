@@ -216,7 +216,7 @@ class Decoder:
                         rows, block = rows[~same], block[~same]
             while rows.size:
                 layout = self._new(block[0].tobytes())
-                if layout is None:  # each layout takes a reading field by field
+                if layout is None:  # broken; each such message is read field by field
                     self.broken += 1
                     rows, block = rows[1:], block[1:]
                     continue

@@ -24,7 +24,7 @@ TRAIL = 300
 NICENESS = 10
 #: Distance of the first target from the arm's position [rad].
 STEP = 1.0
-#: Port that Foxglove opens by default.
+#: Port to which Foxglove connects by default.
 FOXGLOVE = 8765
 #: Number of joint positions of a planned motion between two points.
 PIECES = 24
@@ -311,7 +311,7 @@ def between(start, points):
 
 
 def first_target(arm, q):
-    """Target that the page proposes at first: it moves every joint of an arm without weight, one joint of others."""
+    """Target that the page proposes at first: it moves every joint of an arm without weight, the first of others."""
     heavy = np.linalg.norm(arm.gravity) > 0.0
     step = np.zeros(len(q))
     step[: 1 if heavy else None] = STEP

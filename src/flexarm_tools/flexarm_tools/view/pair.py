@@ -5,13 +5,13 @@ import numpy as np
 
 #: Time for which the tip is watched after a motion's end, and minimum time before the next motion [s].
 WATCHED, PAUSE = 4.0, 1.0
-#: A motion that has not ended by this time after its planned end is given up [s].
+#: A motion is given up if it does not begin within this time, or still moves this long after the tip was watched [s].
 PATIENCE = 10.0
 WITH, WITHOUT = "with fast control", "without"
 
 
 class Pair:
-    """Moves to a target and back with the fast control, then without it, and keeps the tip's errors of both motions.
+    """Moves to a target and back with the fast control, then without it, and keeps the tip's errors on the ways there.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ PERSISTENT = 4
 SCALE = 0.1
 #: The same, and the factor of what the trapezoidal rule can miss, for modes that are fast for the sampling [-].
 FAST_SCALE, FAST_MISSED = 0.35, 2.0
-#: Phase of a mode per sample from which on the next mode may be aliased [rad], and length from which a window counts.
+#: Phase of a mode per sample from which on the next mode may be aliased [rad], and samples from which a window counts.
 ALIASED, LONG = 2.0, 100
 #: Delay of a rate that its source has filtered [s].
 LATE = 0.005
