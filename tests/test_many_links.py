@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms of several links as a user runs them: the simulator node, the composite controller."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
 from harness import Drive
 from in_process import InProcess
 
@@ -16,6 +19,7 @@ from flexarm_studies.loop import closed_loop, parameter_files
 from flexarm_tools.recording import recorder
 from flexarm_tools.running import lockstep
 
+ROOT = Path(__file__).parents[1]
 FILE, GOAL, DURATION = "two_link_composite", (0.8, 0.8), 6.0
 #: The nodes do what the loop without ROS does: the motion's first second shows it.
 SHORT = 1.0
@@ -39,6 +43,19 @@ def test_the_simulator_runs_each_shipped_arm(name):
     if arm.gauges:
         sag = model.build(arm).static_deflection(np.zeros(len(arm.joints)))
         assert np.abs(np.array(state.modal_amplitude) - sag).max() < 2e-2
+
+
+def test_friction_that_makes_a_light_joint_hunt_in_the_simulator_is_reported(tmp_path, flexarm):
+    tree = yaml.safe_load((ROOT / "config" / "arms" / "two_link.yaml").read_text())
+    tree["joints"][1]["hub_inertia"] = 1e-5
+    tree["joints"][1]["friction"] = {"coulomb": 10.0}
+    path = tmp_path / "rubbing.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    code, _, err = flexarm("simulate", path, "--duration", "0.01")
+    assert code == 0 and "may hunt" in err
+    with InProcess() as bench:
+        bench.start("simulator", {"arm": str(path), "lockstep": True, "pause_at": -1.0})
+        assert "may hunt" in bench.log("simulator")
 
 
 def quintic():

@@ -8,8 +8,8 @@ from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.models.fixed_step import MAX_SUBSTEPS, METHODS, PHASE_PER_STEP, substeps
 
 __all__ = [
-    "MAX_SUBSTEPS", "METHODS", "PHASE_PER_STEP", "integrate", "plant_substeps", "straight_mass_matrix", "substeps",
-    "turning_rate",
+    "MAX_SUBSTEPS", "METHODS", "PHASE_PER_STEP", "friction_warning", "integrate", "plant_substeps",
+    "straight_mass_matrix", "substeps", "turning_rate",
 ]  # fmt: skip
 
 #: Largest product of an explicit method's substep and the rate at which friction damps a joint that reverses, and
@@ -47,8 +47,29 @@ def plant_substeps(model, period, method="dop853"):
     count = substeps(model, period, method)
     if METHODS[method] is None:
         return count
-    more = int(np.ceil(turning_rate(model) * period / count / FRICTION_PER_STEP))
-    return count * min(max(more, 1), MOST)
+    return count * min(_more(model, period, count), MOST)
+
+
+def _more(model, period, count):
+    """Factor by which friction increases a `count` of substeps per `period` [s], without a limit."""
+    return max(int(np.ceil(turning_rate(model) * period / count / FRICTION_PER_STEP)), 1)
+
+
+def friction_warning(model, period, method="dop853"):
+    """What to tell a user where the substeps of a `period` [s] stay too long for the friction; else empty.
+
+    `plant_substeps` takes at most `MOST` times as many as the modes need.
+    """
+    if METHODS[method] is None:
+        return ""
+    more = _more(model, period, substeps(model, period, method))
+    if more <= MOST:
+        return ""
+    return (
+        f"friction stops a light joint of arm {model.arm.name} {more / MOST:.3g} times too fast for the steps of the"
+        f" integrator ({turning_rate(model):.3g} 1/s): such a joint may hunt, which the arm would not do. Take a higher"
+        " rate, a larger friction.smoothing, or write rotor_inertia or hub_inertia"
+    )
 
 
 def integrate(model, state, torque, times, rtol=1e-10, atol=1e-12):

@@ -75,6 +75,8 @@ class Simulator:
         Number of the present sample.
     range : levels.Range
         Its `warning` states when the simulated arm has left the range of its level.
+    friction_warning : str
+        States that friction may make a light joint of the simulated arm hunt; empty where it does not.
     stamp_ns : int
         Its time [ns]: sequence times the period, from `START_NS`.
     position, velocity, torque, strain, amplitude, rate : ndarray
@@ -103,6 +105,9 @@ class Simulator:
         self.period_ns = round(1e9 / settings["rate"])
         self._samples_per_check = max(1, round(CHECK_PERIOD * settings["rate"]))
         self.plant = Plant(self.plant_model, 1e-9 * self.period_ns, settings["integrator"])
+        self.friction_warning = integrators.friction_warning(
+            self.plant_model, self.plant.period, settings["integrator"]
+        )
         self.sensors = Sensors(
             self.plant_model, settings["noise"], settings["seed"], 1e-9 * self.period_ns
         )

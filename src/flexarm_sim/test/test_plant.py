@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plant: motion under torque, energy, safe actions, errors."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import ModelError, ShapeError
 from flexarm_dynamics.models import model
-from flexarm_sim.integrators import integrate, turning_rate
+from flexarm_sim.integrators import friction_warning, integrate, turning_rate
 from flexarm_sim.plant import Plant
 
 DEGREE = np.pi / 180.0
@@ -243,6 +244,17 @@ def test_friction_of_a_light_joint_shortens_the_steps_of_explicit_methods():
     assert counts[1] == [1, 1, 1]
     none, some, much = counts[0]
     assert 2 * none <= some <= 3 * none and much == 16 * none
+
+
+def test_friction_that_no_number_of_substeps_is_enough_for_is_reported():
+    assert not friction_warning(light_elbow(0.05), 1e-3)
+    text = friction_warning(light_elbow(10.0), 1e-3)
+    assert "may hunt" in text and "friction.smoothing" in text
+    # The factor that is missing, and with it the rate at which the warning goes.
+    missing = float(re.search(r"([\d.]+) times too fast", text)[1])
+    assert missing > 1.0
+    assert friction_warning(light_elbow(10.0), 1.2e-3 / missing / 1.3) == ""
+    assert friction_warning(light_elbow(10.0), 1e-3, "implicit") == ""
 
 
 def test_breakaway_counts_as_friction_at_rest():

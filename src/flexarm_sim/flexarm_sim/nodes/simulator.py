@@ -90,6 +90,8 @@ class SimulatorNode(Driver):
         self.get_logger().info(
             f"arm {self.arm.name}, level {level}, {self.pacing.name}, {rate:g} Hz"
         )
+        if self.sim.friction_warning:
+            self.get_logger().warning(self.sim.friction_warning)
         self._publish_sample()
         self.pacing.go_on()
 

@@ -162,6 +162,8 @@ def warnings(scenario, loop):
         )
     if loop.simulator.range.warning:
         yield loop.simulator.range.warning
+    if loop.simulator.friction_warning:
+        yield loop.simulator.friction_warning
     if loop.unprepared:
         yield f"no preview of the trajectory: {loop.unprepared}"
     if scenario.noise and not any(g.noise or g.drift for g in gauges):

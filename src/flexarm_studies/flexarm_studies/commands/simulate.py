@@ -13,7 +13,7 @@ import numpy as np
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.errors import FlexarmError, ModelError
 from flexarm_dynamics.models import levels, model
-from flexarm_sim.integrators import METHODS, plant_substeps, substeps
+from flexarm_sim.integrators import METHODS, friction_warning, plant_substeps, substeps
 
 from .. import tables
 from ..identification.prescribed import prescribed_torque
@@ -140,6 +140,8 @@ def simulate(options, recorder=None, reader=read_csv):
         run = _free(arm_model, drive, q, times, options)
     else:
         run = _prescribed(arm_model, motion, times, options)
+    if motion is None and (rubs := friction_warning(arm_model, options.step, options.method)):
+        print(f"flexarm simulate: {rubs}", file=sys.stderr)
     progress = Progress() if times.size > SHOWN else None
     if progress:
         progress.step(f"{arm.name}, {times[-1] - times[0]:g} s")
