@@ -15,9 +15,10 @@ from .loop import sampled_loop
 WORKSPACE = 1.3
 #: Fraction of the decay that is asked of loops without delay, and of those with the file's modes alone.
 UNLIKELY = 0.5
-#: The same of loops with another gain or a longer delay. They are there to leave a margin: such a loop must hold, and
-#: may be slow. With a half in place of a quarter, light hubs are slow with the gain and delay that the arm has.
-MARGIN = 0.25
+#: The same of loops with another gain or a longer delay, in the first search and in the end. They are there to leave a
+#: margin: such a loop must hold, and may be slow. With a half to the end, light hubs are slow with the gain and delay
+#: that the arm has; with a quarter from the start, the search ends more often far from the best.
+STRICT, MARGIN = 0.5, 0.25
 #: Of an arm that sticks: parts of the damper that its Coulomb friction is at rest, as movements of several sizes meet
 #: it, and the fraction that is asked of each. At rest it creeps: friction over stiffness is its time.
 STICKING = {1.0: 0.1, 0.1: 0.3}
@@ -39,6 +40,8 @@ class Uncertainty:
         So much later than the stated delay a torque may come, in periods [-].
     edges : bool
         Whether it is also looked at arms of which payload or stiffness alone differs.
+    margin : float
+        Fraction of the decay that is asked of loops with another gain or a later torque [-].
     """
 
     payload: tuple = (0.7, 1.3)
@@ -47,6 +50,7 @@ class Uncertainty:
     gain: tuple = (0.6, 1.7)
     delay: float = 1.0
     edges: bool = False
+    margin: float = MARGIN
 
 
 def configurations(arm, seed=0):
@@ -169,9 +173,8 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
                 except ModelError:  # heavier than what rests there
                     continue
     for gain in uncertainty.gain:
-        out.append(
-            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}{here}", MARGIN)
-        )
+        name = f"gain x {gain:g}{here}"
+        out.append(sampled_loop(nominal, stated, at[0], sampling, gain, name, uncertainty.margin))
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
     out.append(
         sampled_loop(
@@ -180,7 +183,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
             at[0],
             later,
             name=f"delay {1e3 * later.delay:.3g} ms{here}",
-            fraction=MARGIN,
+            fraction=uncertainty.margin,
         )
     )
     own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))
