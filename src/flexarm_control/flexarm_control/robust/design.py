@@ -419,6 +419,8 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
     strict = replace(uncertainty, margin=max(STRICT, uncertainty.margin))
+    if len(arm.joints) > 1:
+        uncertainty = strict
     task, say = _Task(arm, settings, strict), _Progress(progress)
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
@@ -428,8 +430,9 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
             found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
         if other.decay > max(WORTH * found.decay, 0.0):
             task, found = short, other
-    task = _Task(arm, settings, uncertainty, task.short)
-    found = task.eased(say.part(USUAL, OTHERWISE), found)
+    if uncertainty != strict:
+        task = _Task(arm, settings, uncertainty, task.short)
+        found = task.eased(say.part(USUAL, OTHERWISE), found)
     if found.decay < SLOW * task.speed:
         task = _Task(arm, settings, replace(uncertainty, edges=True), task.short)
         found = task.from_nearby(say.part(OTHERWISE, 1.0), found)
@@ -553,16 +556,11 @@ class _Task:
         return self._sets(whole, x, used)
 
     def eased(self, progress, found):
-        """What gains lead to that were `found` for more than is asked now; for one joint also a search from the start.
-
-        With several joints such a search takes as long as the first one.
-        """
+        """The better one of a search from gains that were `found` for more than is asked now, and of one from the start."""
         loops, weights = self._held(found.sampling, len(found.K))
         search = self._together_search(loops, weights, found.sampling)
         x = search.refined(search.slowest.scaled(found.K), self.settings.effort * LAST)[1]
         more = self._sets(search, x, found.evaluations + search.evaluations)
-        if self.nominal.n_joints > 1:
-            return more
         other = self.found(progress, more.K[0], -np.inf)
         without, still = (np.isinf(one.sampling.torque_corner) for one in (more, other))
         cost = SLUGGISH if without and not still else 1.0  # of a low pass

@@ -15,9 +15,10 @@ from .loop import sampled_loop
 WORKSPACE = 1.3
 #: Fraction of the decay that is asked of loops without delay, and of those with the file's modes alone.
 UNLIKELY = 0.5
-#: The same of loops with another gain or a longer delay, in the first search and in the end. They are there to leave a
-#: margin: such a loop must hold, and may be slow. With a half to the end, light hubs are slow with the gain and delay
-#: that the arm has; with a quarter from the start, the search ends more often far from the best.
+#: The same of loops with another gain or a longer delay, with several joints and with one. They are there to leave a
+#: margin: such a loop must hold, and may be slow. With a half, one light hub is slow with the gain and delay that the
+#: arm has. Several joints need more: at a torque limit the feedback of all is scaled (`saturation`), and with a quarter
+#: some random arms settle later.
 STRICT, MARGIN = 0.5, 0.25
 #: Of an arm that sticks: parts of the damper that its Coulomb friction is at rest, as movements of several sizes meet
 #: it, and the fraction that is asked of each. At rest it creeps: friction over stiffness is its time.
@@ -41,7 +42,8 @@ class Uncertainty:
     edges : bool
         Whether it is also looked at arms of which payload or stiffness alone differs.
     margin : float
-        Fraction of the decay that is asked of loops with another gain or a later torque [-].
+        Fraction of the decay that is asked of loops with another gain or a later torque, of an arm with one joint; with
+        several it is at least `STRICT` [-].
     """
 
     payload: tuple = (0.7, 1.3)
