@@ -556,7 +556,7 @@ class _Task:
         return self._sets(whole, x, used)
 
     def eased(self, progress, found):
-        """The better one of a search from gains that were `found` for more than is asked now, and of one from the start."""
+        """The better one of a search from gains `found` for more than is asked now, and of one from the start."""
         loops, weights = self._held(found.sampling, len(found.K))
         search = self._together_search(loops, weights, found.sampling)
         x = search.refined(search.slowest.scaled(found.K), self.settings.effort * LAST)[1]
