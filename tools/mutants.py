@@ -1162,7 +1162,7 @@ STEPS = [
         (
             "integrators",
             "friction asks for no shorter steps",
-            "return count * min(max(more, 1), MOST)",
+            "return count * min(_more(model, period, count), MOST)",
             "return count",
         ),
         (
@@ -1170,6 +1170,23 @@ STEPS = [
             "breakaway is no friction",
             "max(f.coulomb, f.breakaway)",
             "f.coulomb",
+        ),
+        (
+            "integrators",
+            "no friction is too much for the steps",
+            "if more <= MOST:",
+            "if True:",
+        ),
+    ),
+    *of(
+        "flexarm_studies",
+        "uncertain",
+        "flexarm_studies/test/test_uncertain.py",
+        (
+            "limits",
+            "what friction holds is a peak",
+            "(np.sqrt(2.0) * plant.arm.reach)",
+            "plant.arm.reach",
         ),
     ),
     *of(

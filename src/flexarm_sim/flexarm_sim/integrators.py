@@ -56,7 +56,7 @@ def _more(model, period, count):
 
 
 def friction_warning(model, period, method="dop853"):
-    """What to tell a user where the substeps of a `period` [s] stay too long for the friction; else empty.
+    """What to tell a user where a `method`'s substeps of a `period` [s] stay too long for the friction; else empty.
 
     `plant_substeps` takes at most `MOST` times as many as the modes need.
     """

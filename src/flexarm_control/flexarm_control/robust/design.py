@@ -30,9 +30,8 @@ from .decay import Slowest, SlowestScheduled, Wanted
 from .held import held_loops
 from .loop import Sampling
 from .noise import Noise
-from .search import LAST, ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
+from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
 from .uncertain import (
-    STRICT,
     Uncertainty,
     configurations,
     own_damping,
@@ -418,21 +417,15 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         Where the arm rests in no configuration, or has nothing to measure its bending by.
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
-    strict = replace(uncertainty, margin=max(STRICT, uncertainty.margin))
-    if len(arm.joints) > 1:
-        uncertainty = strict
-    task, say = _Task(arm, settings, strict), _Progress(progress)
+    task, say = _Task(arm, settings, uncertainty), _Progress(progress)
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
-        short = _Task(arm, settings, strict, short=True)
+        short = _Task(arm, settings, uncertainty, short=True)
         other = short.found(say.part(USUAL, OTHERWISE), gains, LITTLE)
         if max(found.decay, other.decay) < LEAST:
             found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
         if other.decay > max(WORTH * found.decay, 0.0):
             task, found = short, other
-    if uncertainty != strict:
-        task = _Task(arm, settings, uncertainty, task.short)
-        found = task.eased(say.part(USUAL, OTHERWISE), found)
     if found.decay < SLOW * task.speed:
         task = _Task(arm, settings, replace(uncertainty, edges=True), task.short)
         found = task.from_nearby(say.part(OTHERWISE, 1.0), found)
@@ -554,17 +547,6 @@ class _Task:
                 break
             search = self._together_search(asked, weights, sampling)
         return self._sets(whole, x, used)
-
-    def eased(self, progress, found):
-        """The better one of a search from gains `found` for more than is asked now, and of one from the start."""
-        loops, weights = self._held(found.sampling, len(found.K))
-        search = self._together_search(loops, weights, found.sampling)
-        x = search.refined(search.slowest.scaled(found.K), self.settings.effort * LAST)[1]
-        more = self._sets(search, x, found.evaluations + search.evaluations)
-        other = self.found(progress, more.K[0], -np.inf)
-        without, still = (np.isinf(one.sampling.torque_corner) for one in (more, other))
-        cost = SLUGGISH if without and not still else 1.0  # of a low pass
-        return other if other.decay > cost * more.decay else more
 
     def from_nearby(self, progress, found):
         """The best of what the search reaches from the gains that were `found` and nearby, see `nearby`."""

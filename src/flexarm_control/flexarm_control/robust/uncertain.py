@@ -13,13 +13,8 @@ from .loop import sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
-#: Fraction of the decay that is asked of loops without delay, and of those with the file's modes alone.
+#: Fraction of the decay that is asked of loops with another gain or delay.
 UNLIKELY = 0.5
-#: The same of loops with another gain or a longer delay, with several joints and with one. They are there to leave a
-#: margin: such a loop must hold, and may be slow. With a half, one light hub is slow with the gain and delay that the
-#: arm has. Several joints need more: at a torque limit the feedback of all is scaled (`saturation`), and with a quarter
-#: some random arms settle later.
-STRICT, MARGIN = 0.5, 0.25
 #: Of an arm that sticks: parts of the damper that its Coulomb friction is at rest, as movements of several sizes meet
 #: it, and the fraction that is asked of each. At rest it creeps: friction over stiffness is its time.
 STICKING = {1.0: 0.1, 0.1: 0.3}
@@ -41,9 +36,6 @@ class Uncertainty:
         So much later than the stated delay a torque may come, in periods [-].
     edges : bool
         Whether it is also looked at arms of which payload or stiffness alone differs.
-    margin : float
-        Fraction of the decay that is asked of loops with another gain or a later torque, of an arm with one joint; with
-        several it is at least `STRICT` [-].
     """
 
     payload: tuple = (0.7, 1.3)
@@ -52,7 +44,6 @@ class Uncertainty:
     gain: tuple = (0.6, 1.7)
     delay: float = 1.0
     edges: bool = False
-    margin: float = MARGIN
 
 
 def configurations(arm, seed=0):
@@ -175,8 +166,9 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
                 except ModelError:  # heavier than what rests there
                     continue
     for gain in uncertainty.gain:
-        name = f"gain x {gain:g}{here}"
-        out.append(sampled_loop(nominal, stated, at[0], sampling, gain, name, uncertainty.margin))
+        out.append(
+            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}{here}", UNLIKELY)
+        )
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
     out.append(
         sampled_loop(
@@ -185,7 +177,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
             at[0],
             later,
             name=f"delay {1e3 * later.delay:.3g} ms{here}",
-            fraction=uncertainty.margin,
+            fraction=UNLIKELY,
         )
     )
     own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))
