@@ -48,7 +48,7 @@ def test_the_sentences_have_the_runs_own_numbers(summaries):
     slow, composite, designed = summaries
     text = "\n".join(tables.gained(summaries))
     for row in summaries:
-        assert f"{row['peak_joint_error_deg']:.2g} deg" in text
+        assert f"{row['peak_joint_error_deg']:.2f} deg" in text
         assert f"{row['settling_time_s']:.2f} s after" in text
     ratio = composite["peak_joint_error_deg"] / designed["peak_joint_error_deg"]
     assert f"{float(f'{ratio:.2g}'):g} times less joint error" in text

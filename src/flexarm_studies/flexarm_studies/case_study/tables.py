@@ -98,7 +98,7 @@ def gained(summaries):
             else f"is at rest within 1 mm {settled:.2f} s after the motion"
         )
         lines.append(
-            f"  {heavier.NAMES[control] + ':':20} the joint is up to {s['peak_joint_error_deg']:.2g} deg off; the tip"
+            f"  {heavier.NAMES[control] + ':':20} the joint is up to {s['peak_joint_error_deg']:.2f} deg off; the tip"
             f" vibrates by {1e3 * FOOT * s['residual_tip_rms_ft']:.2g} mm rms and {rest}"
         )
     return lines + [f"  {sentence}" for sentence in compared(summaries)]
