@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms of several links as a user runs them: the simulator node, the composite controller."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +52,10 @@ def test_friction_that_makes_a_light_joint_hunt_in_the_simulator_is_reported(tmp
     tree["joints"][1]["friction"] = {"coulomb": 10.0}
     path = tmp_path / "rubbing.yaml"
     path.write_text(yaml.safe_dump(tree))
-    code, _, err = flexarm("simulate", path, "--duration", "0.01")
-    assert code == 0 and "may hunt" in err
+    words = "simulate", path, "--duration", "0.01", "--json", "--out", tmp_path / "out.csv"
+    code, printed, err = flexarm(*words)
+    (warning,) = json.loads(printed)["warnings"]
+    assert code == 0 and "may hunt" in err and warning in err
     with InProcess() as bench:
         bench.start("simulator", {"arm": str(path), "lockstep": True, "pause_at": -1.0})
         assert "may hunt" in bench.log("simulator")

@@ -550,9 +550,7 @@ def test_a_rigid_arm_gives_way_at_its_joints_alone():
     assert 0.0 < bears.settling < 5.0
     assert len(poles(found)) == len(found.slowest)
     for (name, _, s), (same, slowest, _) in zip(poles(found), found.slowest, strict=True):
-        assert (
-            name == same and np.abs(s - slowest).min() < 1e-4
-        )  # two poles that meet move by the root of a rounding
+        assert name == same and np.abs(s - slowest).min() < 1e-6
 
 
 def test_a_mode_that_no_torque_reaches_is_left_to_itself():

@@ -68,7 +68,7 @@ def friction_warning(model, period, method="dop853"):
     return (
         f"friction stops a light joint of arm {model.arm.name} {more / MOST:.3g} times too fast for the steps of the"
         f" integrator ({turning_rate(model):.3g} 1/s): such a joint may hunt, which the arm would not do. Take a higher"
-        " rate, a larger friction.smoothing, or write rotor_inertia or hub_inertia"
+        " rate, the integrator implicit, a larger friction.smoothing, or write rotor_inertia or hub_inertia"
     )
 
 

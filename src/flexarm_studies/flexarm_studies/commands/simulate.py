@@ -140,7 +140,8 @@ def simulate(options, recorder=None, reader=read_csv):
         run = _free(arm_model, drive, q, times, options)
     else:
         run = _prescribed(arm_model, motion, times, options)
-    if motion is None and (rubs := friction_warning(arm_model, options.step, options.method)):
+    rubs = "" if motion is not None else friction_warning(arm_model, options.step, options.method)
+    if rubs:
         print(f"flexarm simulate: {rubs}", file=sys.stderr)
     progress = Progress() if times.size > SHOWN else None
     if progress:
@@ -160,7 +161,7 @@ def simulate(options, recorder=None, reader=read_csv):
             progress.fraction(k / times.size)
     if progress:
         progress.done()
-    _report(options, arm_model, columns, rows, inside)
+    _report(options, arm_model, columns, rows, inside, rubs)
     return columns, rows
 
 
@@ -296,7 +297,7 @@ def _known_of(drive, motion, joints):
     return levels.Drive(acceleration=accelerations, velocity=speeds)
 
 
-def _report(options, arm_model, columns, rows, inside):
+def _report(options, arm_model, columns, rows, inside, rubs):
     arm = arm_model.arm
     if options.out or not options.json:
         tables.write(columns, rows, options.out)
@@ -304,7 +305,7 @@ def _report(options, arm_model, columns, rows, inside):
         result = {"arm": arm.name, "model": arm.model, "level": inside.level, "columns": columns}
         result |= {
             "left_out_mm": 1e3 * inside.error,
-            "warnings": [inside.warning] * bool(inside.warning),
+            "warnings": [text for text in (inside.warning, rubs) if text],
         }
         if options.out:
             result |= {"out": options.out, "rows": len(rows)}

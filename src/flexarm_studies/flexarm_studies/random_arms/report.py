@@ -34,8 +34,8 @@ MISSES = (
 MISSED = "arm", "design", "decay"  # and the plants
 LOUD = (
     "Arms whose tip vibrates more than that with noise, rms over the reach. *Exact*: the same arm without noise and"
-    " delay. *Held*: vibration of the lowest mode that torque reaches, below which friction holds the joints. A smaller"
-    " one decays with the links' own damping alone, unless the control overcomes the friction."
+    " delay. *Held*: vibration of the lowest mode that torque reaches, below which Coulomb friction holds the joints. A"
+    " smaller one decays with the links' own damping, as far as the control does not overcome the friction."
 )
 LOUDER = (
     "arm", "design", "noisy", "noise alone", "exact", "held", "lowest mode that torque reaches [Hz]",
@@ -165,11 +165,12 @@ def loud(rows, seed):
         path = scenarios.trajectory_of(case.motion, plant, np.zeros(plant.n_joints))
         modes = ringing(plant, np.array(path.positions[-1]))
         free = next((mode.frequency for mode in modes if not mode.reached), None)
-        lowest = next(mode for mode in modes if mode.reached)
+        lowest = next((mode for mode in modes if mode.reached), None)
         own = exact.get((row["number"], row["controller"]))
-        sizes = row["residual_tip"], row["noise_tip"], own, lowest.held
+        held, hertz = (lowest.held, lowest.frequency) if lowest else (None, None)
+        sizes = row["residual_tip"], row["noise_tip"], own, held
         words = (None if size is None else f"{size:.1e}" for size in sizes)
-        yield row["arm"], row["controller"], *words, lowest.frequency, free
+        yield row["arm"], row["controller"], *words, hertz, free
 
 
 def _quiet(row):
