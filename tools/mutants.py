@@ -469,6 +469,47 @@ LAWS = [
     ),
     *of(
         "flexarm_control",
+        "robust",
+        TESTS + "test_settling.py",
+        (
+            "settling",
+            "after a motion: forces of the file's arm are left out of the gradient",
+            "+ A.T @ to_A + to_S @ S.T",
+            "+ A.T @ to_A",
+        ),
+        (
+            "settling",
+            "after a motion: the other arm's bending is as stiff as the file's",
+            "(M - other) @ moved + (K - bending) @ x",
+            "(M - other) @ moved",
+        ),
+        (
+            "settling",
+            "after a motion: joints with friction do not stick",
+            "sampling, sticking=part)",
+            "sampling, sticking=0.0)",
+        ),
+        (
+            "settling",
+            "after a motion: early and late count the same",
+            "step * self._time**LATE",
+            "step * self._time**0",
+        ),
+        (
+            "search",
+            "after a motion: poles may be as slow as they like",
+            "            if pole > low:\n",
+            "            if False:\n",
+        ),
+        (
+            "design",
+            "after a motion: every design goes on",
+            "reached <= 0.0 or after(x)[0] < most",
+            "reached <= 0.0",
+        ),
+    ),
+    *of(
+        "flexarm_control",
         "kernels",
         TESTS + "test_robust.py",
         ("eigenvectors", "the gradient's sign", "by_torque /= -period", "by_torque /= period"),

@@ -241,7 +241,7 @@ def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed
     for design_, more in ((designed, set()), (found, alone)):
         assert {name.split(", at")[0] for name, _, _ in design_.slowest} & alone == more
     assert found.evaluations > designed.evaluations
-    assert fractions == sorted(fractions) and 1.0 in fractions[:-1]
+    assert fractions == sorted(fractions) and design_module.NEARBY in fractions[:-1]
 
 
 def test_sets_of_gains_that_are_slow_go_on_from_gains_nearby_together(two_link, monkeypatch):

@@ -31,7 +31,9 @@ from .held import held_loops
 from .loop import Sampling
 from .noise import Noise
 from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
+from .settling import AfterMotion, residuals
 from .uncertain import (
+    UNLIKELY,
     Uncertainty,
     configurations,
     own_damping,
@@ -63,13 +65,18 @@ LITTLE, LEAST = 0.08, 0.05
 #: looks at arms of which payload or stiffness alone differs, too. Then it does so for the loops that do not limit the
 #: others, which keep this decay [-].
 SLOW, TRIES, KEPT = 0.2, 6, 0.055
+#: Where motions leave more than this behind on arms that are not the file's, `settling.AfterMotion`, the search goes on
+#: for gains that leave less, down to this part of it, in at most so many evaluations [-].
+MUCH, LESS, SOONER = 3.5, 0.6, 400
+#: These keep so much of the decay that is reached, and loops that are there for a margin this part of it [-].
+KEEP, MARGIN = 0.8, 0.5
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
 #: joints locked: a plan is integrated in steps of the fastest one [-].
 SPREAD = 2000.0
-#: Of the progress, the end of the usual search, and of what is tried where that reaches little.
-USUAL, OTHERWISE = 0.6, 0.8
+#: Of the progress, the end of the usual search, of what is tried where that reaches little, and of what is nearby.
+USUAL, OTHERWISE, NEARBY = 0.6, 0.8, 0.9
 #: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
 #: can answer, friction would move a joint farther than this [rad]: cancelled, it would make such a joint hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
@@ -428,7 +435,12 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
             task, found = short, other
     if found.decay < SLOW * task.speed:
         task = _Task(arm, settings, replace(uncertainty, edges=True), task.short)
-        found = task.from_nearby(say.part(OTHERWISE, 1.0), found)
+        found = task.from_nearby(say.part(OTHERWISE, NEARBY), found)
+    if found.decay > 0.0 and task.nominal.n_modes:
+        edged = _Task(arm, settings, replace(uncertainty, edges=True), task.short)
+        other = edged.sooner(say.part(NEARBY, 1.0), found)
+        if other is not found:
+            task, found = edged, other
     say.part(0.0, 1.0)(1.0, found.decay)
     return task.design(found)
 
@@ -561,6 +573,29 @@ class _Task:
             _, x = nearby(others, x, *rest)
             used += others.evaluations
         return self._sets(whole, x, used + whole.evaluations)
+
+    def sooner(self, progress, found):
+        """Gains near those that were `found` with which motions leave less behind, where these leave much."""
+        loops, weights = self._held(found.sampling, len(found.K))
+        whole = self._together_search(loops, weights, found.sampling)
+        rest = [
+            (min(k, len(found.K) - 1), one)
+            for k, q in enumerate(self.at)
+            for one in residuals(self.nominal, q, found.sampling, self.uncertainty)
+        ]
+        after, x = AfterMotion(whole.slowest, rest), whole.slowest.scaled(found.K)
+        most, reached = MUCH / self.speed, -whole.value(x)
+        if not rest or reached <= 0.0 or after(x)[0] < most:
+            return found
+        eased = [
+            replace(one, fraction=MARGIN * one.fraction) if one.fraction == UNLIKELY else one
+            for one in loops
+        ]
+        search = self._together_search(eased, weights, found.sampling)
+        keep = max(KEEP * reached, min(reached, LEAST))
+        budget = max(1, round(SOONER * self.settings.effort))
+        x = search.sooner(x, after, keep, budget, LESS * most, progress)
+        return self._sets(whole, x, found.evaluations + whole.evaluations + search.evaluations)
 
     def _held(self, sampling, count):
         """Loops at and between the configurations, and the weights of `count` sets of gains in each."""

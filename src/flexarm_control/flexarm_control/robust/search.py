@@ -27,6 +27,9 @@ AGAIN, APART = 240, 0.1
 PATIENCE, MORE = 3, 0.01
 #: Loops with more states get fewer evaluations.
 SIZE = 65
+#: What motions leave behind: width of the smooth maximum of the poles, and slope of the penalty on a decay below the
+#: least, over that.
+NARROW, STEEP = 0.003, 50.0
 #: A width goes on for as long as it gains this fraction.
 GAIN = 0.02
 
@@ -116,6 +119,42 @@ class Search:
             replace(loop, fraction=part * loop.fraction) if k in near else loop
             for k, loop in enumerate(self.slowest.loops)
         ], near
+
+    def sooner(self, x, after, keep, budget, enough, progress=None):
+        """Scaled gains near x with which motions leave less, and no pole of any loop is slower than `keep`.
+
+        Parameters
+        ----------
+        x : ndarray
+            Scaled gains that hold.
+        after : AfterMotion
+        keep : float
+            Least decay [-].
+        budget : int
+            At most about so many evaluations.
+        enough : float
+            Value of `after` at which the search ends.
+        progress : callable, optional
+            Called with a fraction of the work and the decay.
+        """
+        slow, low, done = self._smooth(self.slowest.loops, NARROW), -keep, 0
+
+        def function(x):
+            nonlocal done
+            done += 1
+            pole, by_pole = slow(x)  # and the penalties
+            if progress is not None:
+                progress(min(done / budget, 1.0), -pole)
+            value, slope = after(x) if np.isfinite(pole) else (np.inf, 0.0 * x)
+            if not np.isfinite(value):
+                return np.inf, np.zeros_like(x)
+            if pole > low:
+                value, slope = value + STEEP * (pole - low) / keep, slope + STEEP / keep * by_pole
+            return value, slope
+
+        found, value, used = minimise(function, x, budget, lambda value: value < enough)
+        self.evaluations += used
+        return found if value < after(x)[0] and self.value(found) < 0.99 * low else x
 
     def _each(self, x):
         """The slowest pole of each loop that gains move, as a value."""

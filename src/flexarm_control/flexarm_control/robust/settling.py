@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""How soon the tip settles after a motion, for arms that are not what the file says; and the gradient by the gains.
+
+The feed-forward moves the arm of the file, :math:`M\ddot x + D\dot x + Kx = Bu` with :math:`x = (q, \delta)`, exactly.
+To an arm with the matrices :math:`M', K'` the same torque leaves the forces
+
+.. math:: f = (M - M')\,\ddot x + (K - K')\,x
+
+to the feedback. They are zero from the end of the motion on, and what they have excited decays. Along a quintic motion
+of a joint by `ANGLE` in `MOTION` locked periods, the bending is taken as quasi-static,
+:math:`\delta = -K_{22}^{-1}M_{21}\ddot q`. The sampled loop (`loop`) with gains K, linear in one configuration, goes on
+from sample to sample by :math:`X_{k+1} = AX_k + Sf_k`. It moves the tip by :math:`y_k = CX_k`, in units of the distance
+within which it is settled. What is made small is about the time until it is, in locked periods T from the motion's end
+on, with a motion j of each joint:
+
+.. math:: J^3 = \frac{3}{T^3}\int_0^{6T} t^2\,\ln\Bigl(1 + \sum_j|y_j(t)|^2\Bigr)\,dt .
+
+Where the logarithm is one until :math:`t = sT`, and then zero, J = s. The gradient by the gains follows from that
+of the adjoint recursion
+
+.. math:: \Lambda_k = A^T\Lambda_{k+1} + C^T\frac{\partial J}{\partial y_k}, \qquad
+    \frac{\partial J}{\partial A} = \sum_k\Lambda_{k+1}X_k^T, \qquad
+    \frac{\partial J}{\partial S} = \sum_k\Lambda_{k+1}f_k^T .
+
+Where a locked period has many samples, several are one step: A and S of two steps are :math:`A^2` and :math:`S + AS`.
+"""
+
+import numpy as np
+
+from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.linear import jacobian, linear_plant, sampled
+from flexarm_dynamics.models.model import build
+
+from .loop import sampled_loop
+from .uncertain import richer
+
+#: A motion turns each joint by this [rad], in so many locked periods; then the tip is looked at for so many.
+ANGLE, MOTION, WATCHED = np.radians(75.0), 2.0, 6.0
+#: The tip has settled within this fraction of the reach [-].
+TOLERANCE = 1e-3
+#: At least so many steps per locked period.
+STEPS = 64
+#: Power of the time by which what is left is weighted: what comes last counts most.
+LATE = 2
+#: An arm with Coulomb friction is also looked at with these parts of the damper that its friction is at rest. What is
+#: left then counts less: the motion is larger than those that meet so much of it.
+STICKING, STICKS = (0.1, 0.3), 0.7
+#: Of the mean over all arms and configurations: the worst counts most.
+MEAN = 8.0
+
+
+class Residual:
+    """What a motion that ends in one configuration leaves at the tip of one arm, under gains K.
+
+    Parameters
+    ----------
+    loop : Loop
+        Of the arm in that configuration.
+    forces : ndarray, shape (k, h, n)
+        Forces on joints and modes in each step of the motion of each joint [N m], [N].
+    push : ndarray, shape (s, h)
+        What a force does to the plant's state in one sample.
+    tip : ndarray, shape (3, h)
+        Jacobian of the tip by joints and deflections, over the tolerance.
+    period : float
+        Of the lowest mode, joints locked [s].
+    doublings : int
+        A step is two to the power of this many samples.
+    share : float
+        Factor of J.
+    """
+
+    def __init__(self, loop, forces, push, tip, period, doublings, share=1.0):
+        self.loop, self._forces, self._doublings = loop, forces, doublings
+        self._share = share
+        self._S = np.zeros((len(loop.F), push.shape[1]))
+        self._S[: len(push)] = push
+        self._C = np.zeros((3, len(loop.F)))
+        self._C[:, : tip.shape[1]] = tip
+        step = loop.period * 2.0**doublings / period
+        self._after = int(np.ceil(WATCHED / step))
+        self._time = step * np.arange(self._after + 1)
+        self._weight = (LATE + 1.0) * step * self._time**LATE
+
+    def _moved(self, K):
+        """Matrices of each doubling, and the states X of all steps, (steps + 1, N, n)."""
+        A, S = self.loop.F - self.loop.G @ (K @ self.loop.N), self._S
+        doubled = [(A, S)]
+        for _ in range(self._doublings):
+            A, S = A @ A, S + A @ S
+            doubled.append((A, S))
+        count = len(self._forces)
+        X = np.zeros((count + self._after + 1, len(A), self._forces.shape[2]))
+        pushed = S @ self._forces
+        for k in range(count):
+            X[k + 1] = A @ X[k] + pushed[k]
+        for k in range(count, len(X) - 1):
+            np.matmul(A, X[k], out=X[k + 1])
+        return doubled, X
+
+    def distance(self, K):
+        """Distance of the tip from its place over the tolerance, in steps from the end of the motion on."""
+        X = self._moved(K)[1][len(self._forces) :]
+        return np.sqrt(((self._C @ X) ** 2).sum(axis=(1, 2)))
+
+    def settling(self, K):
+        """Time from the end of the motion until the tip has settled, in locked periods; infinite: not while watched."""
+        outside = np.flatnonzero(~(self.distance(K) <= 1.0))
+        if not outside.size:
+            return 0.0
+        return np.inf if outside[-1] == self._after else float(self._time[outside[-1] + 1])
+
+    def __call__(self, K):
+        """J, and its gradient by K; infinite where the tip leaves the range of numbers."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            doubled, X = self._moved(K)
+            first, A = len(self._forces), doubled[-1][0]
+            y = self._C @ X[first:]
+            square = (y**2).sum(axis=(1, 2))
+            whole = self._weight @ np.log1p(square)
+        if not 0.0 < whole < np.inf:
+            return (0.0 if whole == 0.0 else np.inf), np.zeros_like(K)
+        value = self._share * whole ** (1.0 / (LATE + 1.0))
+        by_square = value / whole / (LATE + 1.0) * self._weight / (1.0 + square)
+        slope = self._C.T @ (y * (2.0 * by_square)[:, None, None])
+        ahead = np.zeros_like(X)  # Lambda of each step
+        ahead[-1] = slope[-1]
+        for k in range(len(X) - 2, -1, -1):
+            np.matmul(A.T, ahead[k + 1], out=ahead[k])
+            if k >= first:
+                ahead[k] += slope[k - first]
+        to_A = np.tensordot(ahead[1:], X[:-1], axes=((0, 2), (0, 2)))
+        to_S = np.tensordot(ahead[1 : first + 1], self._forces, axes=((0, 2), (0, 2)))
+        for A, S in doubled[-2::-1]:
+            to_A = to_A @ A.T + A.T @ to_A + to_S @ S.T
+            to_S = to_S + A.T @ to_S
+        return float(value), -(self.loop.G.T @ to_A @ self.loop.N.T)
+
+
+class AfterMotion:
+    r"""J of all arms and configurations of a design, :math:`(\sum_i J_i^8)^{1/8}`, as a function of scaled gains.
+
+    Parameters
+    ----------
+    slowest : SlowestScheduled
+        Scales the gains.
+    found : sequence of (int, Residual)
+        Each with the number of its set of gains.
+    """
+
+    def __init__(self, slowest, found):
+        self._slowest, self._found = slowest, found
+
+    def __call__(self, x):
+        """J, and its gradient by the scaled gains x."""
+        K = self._slowest.gains(x)
+        rows = [residual(K[k]) for k, residual in self._found]
+        values = np.array([value for value, _ in rows])
+        most = values.max()
+        if not np.isfinite(most):
+            return np.inf, np.zeros_like(x)
+        value = most * ((values / most) ** MEAN).sum() ** (1.0 / MEAN) if most else 0.0
+        slope = np.zeros_like(K)
+        for (k, _), (one, by_gains) in zip(self._found, rows, strict=True):
+            if one:
+                slope[k] += (one / value) ** (MEAN - 1.0) * by_gains
+        scale, free = self._slowest.scale, self._slowest.free
+        return float(value), np.concatenate([(one * scale)[free] for one in slope])
+
+    def settling(self, x):
+        """Longest settling time of all, in locked periods."""
+        K = self._slowest.gains(x)
+        return max(residual.settling(K[k]) for k, residual in self._found)
+
+
+def residuals(nominal, q, sampling, uncertainty):
+    """The `Residual` of each arm of which payload or stiffness alone differs, in configuration q (n,) [rad]."""
+    n, arm = nominal.n_joints, richer(nominal.arm.whole)
+    period = 2.0 * np.pi / nominal.frequencies(q, locked=True)[0]
+    doublings = max(0, int(np.log2(max(period / STEPS / sampling.period, 1.0))))
+    step, length = sampling.period * 2.0**doublings, MOTION * period
+    s = np.minimum((np.arange(int(np.ceil(length / step))) + 0.5) * step / length, 1.0)
+    acceleration = ANGLE * (60.0 * s - 180.0 * s**2 + 120.0 * s**3) / length**2
+    snap = ANGLE * (720.0 * s - 360.0) / length**4
+    M, K, _ = _matrices(build(arm), q)
+    bent = -np.linalg.solve(K[n:, n:], M[n:, :n])  # by joint accelerations
+    x = np.vstack([np.zeros((n, n)), bent])
+    moved = np.vstack([np.eye(n), np.zeros_like(bent)])
+    (p0, p1), (k0, _) = uncertainty.payload, uncertainty.stiffness
+    parts = (0.0, *(STICKING if any(joint.friction.coulomb for joint in arm.joints) else ()))
+    found = []
+    for payload, stiffness in ((p0, 1.0), (p1, 1.0), (1.0, k0)):
+        plant = build(scaled(arm, payload, stiffness))
+        try:
+            other, bending, A = _matrices(plant, q)
+        except ModelError:  # heavier than what rests there
+            continue
+        forces = np.multiply.outer(acceleration, (M - other) @ moved + (K - bending) @ x)
+        forces += np.multiply.outer(snap, (M - other) @ x)
+        size = len(other)
+        push = np.vstack([np.zeros((size, size)), np.linalg.inv(other)])
+        push = sampled(A, push, sampling.period)[1]
+        place = np.concatenate([q, plant.static_deflection(q)])
+        tip = jacobian(lambda x, m=plant: m.tip_position(x[:n], x[n:]), place)
+        tip /= TOLERANCE * arm.reach
+        for part in parts:
+            loop = sampled_loop(nominal, plant, q, sampling, sticking=part)
+            share = STICKS if part else 1.0
+            found.append(Residual(loop, forces, push, tip, period, doublings, share))
+    return found
+
+
+def _matrices(model, q):
+    """Mass and stiffness of a model at rest in q, (h, h) each, and A of its linear state."""
+    A, _ = linear_plant(model, q, coulomb=False)
+    size, n = len(A) // 2, model.n_joints
+    bent = model.static_deflection(q)
+    M = model.terms(q, np.zeros(n), bent, np.zeros_like(bent)).M
+    return M, -M @ A[size:, :size], A

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What motions leave at the tip of arms that are not the file's, its gradient, and gains that leave less."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+
+from flexarm_control.robust import design as design_module
+from flexarm_control.robust.design import Settings, design, sampling_for
+from flexarm_control.robust.loop import sampled_loop
+from flexarm_control.robust.search import Search
+from flexarm_control.robust.settling import (
+    ANGLE,
+    MOTION,
+    STICKING,
+    STICKS,
+    TOLERANCE,
+    WATCHED,
+    AfterMotion,
+    Residual,
+    residuals,
+)
+from flexarm_control.robust.uncertain import Uncertainty, richer
+from flexarm_dynamics.arm import arm_file
+from flexarm_dynamics.arm.description import scaled
+from flexarm_dynamics.linear import linear_plant
+from flexarm_dynamics.models.model import build
+
+UNCERTAIN = Uncertainty()
+
+
+@pytest.fixture(scope="module")
+def r():
+    """Arm R, its sampling at 500 Hz, and gains that hold it: a stiff, well damped joint."""
+    model = build(arm_file.load("R").known)
+    sampling, _ = sampling_for(model, np.zeros((1, 1)), Settings(500.0, 0.002))
+    found = design(model.arm, Settings(500.0, 0.002, effort=0.3))
+    return SimpleNamespace(model=model, sampling=sampling, K=found.K, design=found)
+
+
+@pytest.mark.parametrize("doublings", [0, 1, 3])
+def test_the_gradient_is_that_of_differences(doublings):
+    rng = np.random.default_rng(doublings)
+    N, n, h = 7, 2, 3
+    F = 0.35 * rng.standard_normal((N, N))
+    loop = SimpleNamespace(
+        F=F, G=rng.standard_normal((N, n)), N=rng.standard_normal((4, N)), period=0.01
+    )
+    forces, push = rng.standard_normal((5, h, n)), rng.standard_normal((4, h))
+    one = Residual(loop, forces, push, rng.standard_normal((3, h)), 0.3, doublings, 0.7)
+    K = 0.1 * rng.standard_normal((n, 4))
+    value, slope = one(K)
+    for _ in range(5):
+        step = 1e-6 * rng.standard_normal(K.shape)
+        assert_allclose(one(K + step)[0] - one(K - step)[0], 2.0 * (slope * step).sum(), rtol=1e-5)
+    assert value > 0.0
+
+
+def test_steps_of_several_samples_leave_what_single_ones_leave():
+    rng = np.random.default_rng(0)
+    N, n = 6, 2
+    loop = SimpleNamespace(
+        F=0.4 * rng.standard_normal((N, N)), G=np.zeros((N, n)), N=np.zeros((3, N)), period=0.01
+    )
+    forces, push, tip = (rng.standard_normal(s) for s in ((3, 2, n), (4, 2), (3, 4)))
+    long = Residual(loop, forces, push, tip, 0.4, 2).distance(np.zeros((n, 3)))
+    short = Residual(loop, np.repeat(forces, 4, axis=0), push, tip, 0.4, 0).distance(
+        np.zeros((n, 3))
+    )
+    assert_allclose(long[:60], short[::4][:60], rtol=1e-9)
+
+
+def test_the_value_is_the_time_until_the_tip_has_settled():
+    """A tip that is e - 1 away, squared, for two periods, and then at its place, has J = 2."""
+    steps = 50
+    loop = SimpleNamespace(F=np.eye(2, k=-1), G=np.zeros((2, 1)), N=np.zeros((1, 2)), period=0.02)
+    one = Residual(loop, np.zeros((1, 1, 1)), np.zeros((1, 1)), np.ones((3, 1)), 1.0, 0)
+    distance = np.where(np.arange(WATCHED * steps + 1) < 2 * steps, np.sqrt(np.e - 1.0), 0.0)
+    X = np.zeros((len(distance) + 1, 2, 1))
+    X[1:, 0, 0] = distance / np.sqrt(3.0)
+    one._moved = lambda K: ([(loop.F, one._S)], X)
+    assert_allclose(one(np.zeros((1, 1)))[0], 2.0, rtol=0.02)
+    assert_allclose(one.settling(np.zeros((1, 1))), 2.0, rtol=1e-9)
+    X[-1] = 1.0
+    assert np.isinf(one.settling(np.zeros((1, 1))))
+
+
+def test_what_is_left_is_that_of_the_linear_arm_in_continuous_time(r):
+    """R with 1.3 times its payload, against an integral of its own equations, with filters and delay negligible."""
+    model, q = r.model, np.zeros(1)
+    infinite = {"joint_corner": np.inf, "modal_corner": 1e5, "torque_corner": np.inf}
+    sampling = replace(r.sampling, period=2e-4, delay=0.0, **infinite)
+    K = r.K.copy()
+    K[:, 2:] = 0.0  # stiffness and damping of the joint alone
+    own, other = richer(model.arm.whole), scaled(richer(model.arm.whole), 1.3)
+    heavier = Uncertainty(payload=(1.0, 1.3), stiffness=(1.0, 1.0))
+    same, one, _ = residuals(model, q, sampling, heavier)
+    A, M = [], []
+    for arm in (own, other):
+        plant = build(arm)
+        A.append(linear_plant(plant, q, coulomb=False)[0])
+        M.append(plant.terms(q, np.zeros(1)).M.copy())
+    half = len(M[0])
+    bending = [-mass @ a[half:, :half] for mass, a in zip(M, A, strict=True)]
+    gains = K @ sampled_loop(model, build(other), q, sampling).N[:, : 2 * half]
+    period = 2.0 * np.pi / model.frequencies(q, locked=True)[0]
+    length = MOTION * period
+    bent = -np.linalg.solve(bending[0][1:, 1:], M[0][1:, 0])
+
+    def slope(t, x):
+        s, force = t / length, np.zeros(half)
+        if s < 1.0:
+            acceleration = ANGLE * (60.0 * s - 180.0 * s**2 + 120.0 * s**3) / length**2
+            snap = ANGLE * (720.0 * s - 360.0) / length**4
+            force += (M[0] - M[1]) @ np.concatenate([[acceleration], bent * snap])
+            force += (bending[0] - bending[1])[:, 1:] @ bent * acceleration
+        force[0] -= (gains @ x)[0]
+        return A[1] @ x + np.concatenate([np.zeros(half), np.linalg.solve(M[1], force)])
+
+    times = length + period * one._time
+    begin = np.zeros(2 * half)
+    moving = solve_ivp(slope, (0.0, length), begin, rtol=1e-8, atol=1e-12).y[:, -1]
+    after = solve_ivp(slope, (length, times[-1]), moving, t_eval=times, rtol=1e-8, atol=1e-12)
+    tip = np.linalg.norm(one._C[:, : 2 * half] @ after.y, axis=0)
+    assert tip[0] > 1.0
+    assert_allclose(one.distance(K), tip, atol=0.03 * tip.max())
+    assert_allclose(same.distance(K), 0.0, atol=1e-6)
+
+
+def test_the_arms_are_those_with_another_payload_or_softer_links_and_they_stick_with_friction(r):
+    model, q = r.model, np.zeros(1)
+    moved = residuals(model, q, r.sampling, UNCERTAIN)
+    assert len(moved) == 3
+    joints = tuple(replace(j, friction=replace(j.friction, coulomb=0.1)) for j in model.arm.joints)
+    rubbing = build(replace(model.arm, joints=joints))
+    found = residuals(rubbing, q, r.sampling, UNCERTAIN)
+    assert len(found) == 3 * (1 + len(STICKING))
+    assert [one._share for one in found] == 3 * [1.0, STICKS, STICKS]
+    # Nothing but the damper differs from the arm without friction.
+    assert_allclose(found[0](r.K)[0], moved[0](r.K)[0], rtol=1e-9)
+    assert abs(found[1](r.K)[0] / STICKS - moved[0](r.K)[0]) > 1e-3
+    assert_allclose(np.linalg.norm(moved[0]._C[:, 0]), 1.0 / TOLERANCE, rtol=1e-3)
+
+
+def test_the_whole_is_about_the_worst_of_all_and_its_gradient_that_of_differences():
+    rng = np.random.default_rng(1)
+    scale = np.array([[2.0, 0.0, 3.0]])
+    centres = rng.standard_normal((3, 1, 3))
+    slowest = SimpleNamespace(
+        scale=scale,
+        free=scale > 0.0,
+        gains=lambda x: np.stack([np.insert(one, 1, 0.0)[None] * scale for one in x.reshape(2, 2)]),
+    )
+    found = [
+        (k, lambda K, c=c: (float(((K - c) ** 2).sum()), 2.0 * (K - c)))
+        for k, c in zip((0, 1, 1), centres, strict=True)
+    ]
+    whole, x = AfterMotion(slowest, found), rng.standard_normal(4)
+    value, slope = whole(x)
+    each = [one(slowest.gains(x)[k])[0] for k, one in found]
+    assert max(each) <= value < 1.15 * max(each)
+    for step in 1e-6 * np.eye(4):
+        assert_allclose(
+            whole(x + step)[0] - whole(x - step)[0], 2.0 * slope @ step, rtol=1e-6, atol=1e-12
+        )
+
+
+def test_an_arm_that_is_what_its_file_says_leaves_nothing(r):
+    none = Uncertainty(payload=(1.0, 1.0), stiffness=(1.0, 1.0))
+    slowest = SimpleNamespace(gains=lambda x: r.K[None], scale=np.ones(r.K.shape), free=r.K != 0.0)
+    found = [(0, one) for one in residuals(r.model, np.zeros(1), r.sampling, none)]
+    value, slope = AfterMotion(slowest, found)(np.zeros(1))
+    assert value == 0.0 and not slope.any()
+
+
+def lasting(found):
+    """J of a design, and its settling time in locked periods."""
+    task = design_module._Task(found.arm, found.settings, found.uncertainty)
+    loops, weights = task._held(found.sampling, len(found.sets))
+    search = task._together_search(loops, weights, found.sampling)
+    rest = [(0, one) for one in residuals(task.nominal, task.at[0], found.sampling, UNCERTAIN)]
+    after, x = AfterMotion(search.slowest, rest), search.slowest.scaled(found.sets)
+    return after(x)[0], after.settling(x), -search.value(x)
+
+
+def test_a_design_whose_motions_leave_much_goes_on_for_gains_that_leave_less(r, monkeypatch):
+    before, settled, reached = lasting(r.design)
+    monkeypatch.setattr(design_module, "MUCH", 0.9 * before)
+    fractions = []
+    other = design(r.model.arm, r.design.settings, progress=lambda part, _: fractions.append(part))
+    assert len([part for part in fractions if design_module.NEARBY < part < 1.0]) > 10
+    after, sooner, _ = lasting(other)
+    assert after < 0.8 * before and sooner < settled
+    assert other.holds and other.reached > 0.79 * min(reached, r.design.reached)
+    # Less is asked of a slow design.
+    monkeypatch.setattr(design_module, "MUCH", 1.1 * before)
+    assert_allclose(design(r.model.arm, r.design.settings).K, r.design.K)
+
+
+def test_gains_that_would_be_slower_than_asked_are_not_taken(r):
+    task = design_module._Task(r.design.arm, r.design.settings, UNCERTAIN)
+    loops, weights = task._held(r.design.sampling, 1)
+    search = task._together_search(loops, weights, r.design.sampling)
+    x = search.slowest.scaled(r.design.sets)
+    reached = -search.value(x)
+
+    size = x @ x
+
+    def pulls(y):
+        """Gains that are all zero would be best."""
+        return 5.0 * float(y @ y) / size, 10.0 * y / size
+
+    found = search.sooner(x, pulls, 0.8 * reached, 60, 0.0)
+    assert pulls(found)[0] < pulls(x)[0] and -search.value(found) > 0.79 * reached
+    assert isinstance(search, Search)
