@@ -480,8 +480,8 @@ LAWS = [
         (
             "settling",
             "after a motion: the other arm's bending is as stiff as the file's",
-            "(M - other) @ moved + (K - bending) @ x",
-            "(M - other) @ moved",
+            "(M - M_other) @ moved + (K - K_other) @ bending",
+            "(M - M_other) @ moved",
         ),
         (
             "settling",

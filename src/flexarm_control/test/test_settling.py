@@ -10,14 +10,14 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from flexarm_control.robust import design as design_module
+from flexarm_control.robust import search as search_module
 from flexarm_control.robust.design import Settings, design, sampling_for
 from flexarm_control.robust.loop import sampled_loop
-from flexarm_control.robust.search import Search
 from flexarm_control.robust.settling import (
     ANGLE,
     MOTION,
-    STICKING,
-    STICKS,
+    RUBBING,
+    RUBS,
     TOLERANCE,
     WATCHED,
     AfterMotion,
@@ -138,11 +138,11 @@ def test_the_arms_are_those_with_another_payload_or_softer_links_and_they_stick_
     joints = tuple(replace(j, friction=replace(j.friction, coulomb=0.1)) for j in model.arm.joints)
     rubbing = build(replace(model.arm, joints=joints))
     found = residuals(rubbing, q, r.sampling, UNCERTAIN)
-    assert len(found) == 3 * (1 + len(STICKING))
-    assert [one._share for one in found] == 3 * [1.0, STICKS, STICKS]
+    assert len(found) == 3 * (1 + len(RUBBING))
+    assert [one._share for one in found] == 3 * [1.0, RUBS, RUBS]
     # Nothing but the damper differs from the arm without friction.
     assert_allclose(found[0](r.K)[0], moved[0](r.K)[0], rtol=1e-9)
-    assert abs(found[1](r.K)[0] / STICKS - moved[0](r.K)[0]) > 1e-3
+    assert abs(found[1](r.K)[0] / RUBS - moved[0](r.K)[0]) > 1e-3
     assert_allclose(np.linalg.norm(moved[0]._C[:, 0]), 1.0 / TOLERANCE, rtol=1e-3)
 
 
@@ -192,16 +192,20 @@ def test_a_design_whose_motions_leave_much_goes_on_for_gains_that_leave_less(r, 
     monkeypatch.setattr(design_module, "MUCH", 0.9 * before)
     fractions = []
     other = design(r.model.arm, r.design.settings, progress=lambda part, _: fractions.append(part))
-    assert len([part for part in fractions if design_module.NEARBY < part < 1.0]) > 10
+    assert any(design_module.NEARBY < part < 1.0 for part in fractions)
     after, sooner, _ = lasting(other)
     assert after < 0.8 * before and sooner < settled
     assert other.holds and other.reached > 0.79 * min(reached, r.design.reached)
-    # Less is asked of a slow design.
-    monkeypatch.setattr(design_module, "MUCH", 1.1 * before)
-    assert_allclose(design(r.model.arm, r.design.settings).K, r.design.K)
 
 
-def test_gains_that_would_be_slower_than_asked_are_not_taken(r):
+def test_a_slow_design_may_leave_more(r, monkeypatch):
+    settings = replace(r.design.settings, speed=0.5)
+    slow = design(r.model.arm, settings)
+    monkeypatch.setattr(design_module, "MUCH", 0.6 * lasting(slow)[0])
+    assert_allclose(design(r.model.arm, settings).K, slow.K, rtol=0.0)
+
+
+def test_gains_that_would_be_slower_than_asked_are_not_taken(r, monkeypatch):
     task = design_module._Task(r.design.arm, r.design.settings, UNCERTAIN)
     loops, weights = task._held(r.design.sampling, 1)
     search = task._together_search(loops, weights, r.design.sampling)
@@ -215,5 +219,11 @@ def test_gains_that_would_be_slower_than_asked_are_not_taken(r):
         return 5.0 * float(y @ y) / size, 10.0 * y / size
 
     found = search.sooner(x, pulls, 0.8 * reached, 60, 0.0)
-    assert pulls(found)[0] < pulls(x)[0] and -search.value(found) > 0.79 * reached
-    assert isinstance(search, Search)
+    assert pulls(found)[0] < 0.85 * pulls(x)[0] and -search.value(found) > 0.79 * reached
+    # Without a penalty they are found, and not taken; nor are gains that bring little.
+    monkeypatch.setattr(search_module, "STEEP", 0.0)
+    assert search.sooner(x, pulls, 0.8 * reached, 60, 0.0) is x
+    assert (
+        search.sooner(x, lambda y: (1.0 + 0.01 * pulls(y)[0], 0.01 * pulls(y)[1]), 1e-3, 60, 0.0)
+        is x
+    )

@@ -15,12 +15,13 @@ from flexarm_studies.uncertain.baselines import RATE, task_of
 from flexarm_studies.uncertain.plants import DELAY, VARIANTS
 
 
-def test_the_tip_settles_when_the_design_predicts():
-    """One link under gravity, with finite slopes, a mode more, friction; within half a locked period.
+@pytest.mark.parametrize("number", [9, 33])
+def test_the_tip_settles_when_the_design_predicts(number):
+    """One link with finite slopes, a mode more and friction, a slow arm and a quick one; within half a locked period.
 
     The linear arm at rest knows neither the configurations on the way nor the motion's own bending.
     """
-    case = generator.arm(9)
+    case = generator.arm(number)
     start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
     places = (middle, start, end)
     found = design(case.read(), Settings(RATE, DELAY, configurations=places, effort=0.3))

@@ -65,10 +65,12 @@ LITTLE, LEAST = 0.08, 0.05
 #: looks at arms of which payload or stiffness alone differs, too. Then it does so for the loops that do not limit the
 #: others, which keep this decay [-].
 SLOW, TRIES, KEPT = 0.2, 6, 0.055
-#: Where motions leave more than this behind on arms that are not the file's, `settling.AfterMotion`, the search goes on
-#: for gains that leave less, down to this part of it, in at most so many evaluations [-].
-MUCH, LESS, SOONER = 3.5, 0.6, 400
-#: These keep so much of the decay that is reached, and loops that are there for a margin this part of it [-].
+#: Where motions leave more than this on arms that are not the file's (`settling.AfterMotion`), the search goes on for
+#: gains that leave less, down to this part of it, in at most so many evaluations; in fewer for more configurations
+#: than these.
+MUCH, LESS, SOONER, PLACES = 3.5, 0.6, 400, 3
+#: The slowest pole of all loops then keeps this part of the decay that was reached. Of loops that are there for a
+#: margin, this part of what was asked is asked [-].
 KEEP, MARGIN = 0.8, 0.5
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
@@ -578,14 +580,14 @@ class _Task:
         """Gains near those that were `found` with which motions leave less behind, where these leave much."""
         loops, weights = self._held(found.sampling, len(found.K))
         whole = self._together_search(loops, weights, found.sampling)
-        rest = [
+        left = [
             (min(k, len(found.K) - 1), one)
             for k, q in enumerate(self.at)
             for one in residuals(self.nominal, q, found.sampling, self.uncertainty)
         ]
-        after, x = AfterMotion(whole.slowest, rest), whole.slowest.scaled(found.K)
+        after, x = AfterMotion(whole.slowest, left), whole.slowest.scaled(found.K)
         most, reached = MUCH / self.speed, -whole.value(x)
-        if not rest or reached <= 0.0 or after(x)[0] < most:
+        if not left or reached <= 0.0 or after(x)[0] < most:
             return found
         eased = [
             replace(one, fraction=MARGIN * one.fraction) if one.fraction == UNLIKELY else one
@@ -593,9 +595,19 @@ class _Task:
         ]
         search = self._together_search(eased, weights, found.sampling)
         keep = max(KEEP * reached, min(reached, LEAST))
-        budget = max(1, round(SOONER * self.settings.effort))
-        x = search.sooner(x, after, keep, budget, LESS * most, progress)
-        return self._sets(whole, x, found.evaluations + whole.evaluations + search.evaluations)
+        budget = SOONER * self.settings.effort * min(1.0, PLACES / len(self.at))
+        other = search.sooner(
+            x,
+            after,
+            keep,
+            max(1, round(budget)),
+            LESS * most,
+            lambda fraction: progress(fraction, found.decay),
+        )
+        if other is x:
+            return found
+        used = found.evaluations + whole.evaluations + search.evaluations
+        return self._sets(whole, other, used)
 
     def _held(self, sampling, count):
         """Loops at and between the configurations, and the weights of `count` sets of gains in each."""

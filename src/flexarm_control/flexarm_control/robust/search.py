@@ -30,6 +30,9 @@ SIZE = 65
 #: What motions leave behind: width of the smooth maximum of the poles, and slope of the penalty on a decay below the
 #: least, over that.
 NARROW, STEEP = 0.003, 50.0
+#: Gains have to leave less than this part of what the others leave: linear loops predict it no better. Progress is
+#: reported after so many evaluations.
+TAKEN, REPORTED = 0.85, 20
 #: A width goes on for as long as it gains this fraction.
 GAIN = 0.02
 
@@ -135,16 +138,21 @@ class Search:
         enough : float
             Value of `after` at which the search ends.
         progress : callable, optional
-            Called with a fraction of the work and the decay.
+            Called with a fraction of the work.
+
+        Returns
+        -------
+        ndarray
+            x itself, if none are found that keep the decay and leave less than `TAKEN` of what x leaves.
         """
         slow, low, done = self._smooth(self.slowest.loops, NARROW), -keep, 0
 
         def function(x):
             nonlocal done
             done += 1
+            if progress is not None and done % REPORTED == 0:
+                progress(min(done / budget, 1.0))
             pole, by_pole = slow(x)  # and the penalties
-            if progress is not None:
-                progress(min(done / budget, 1.0), -pole)
             value, slope = after(x) if np.isfinite(pole) else (np.inf, 0.0 * x)
             if not np.isfinite(value):
                 return np.inf, np.zeros_like(x)
@@ -152,9 +160,10 @@ class Search:
                 value, slope = value + STEEP * (pole - low) / keep, slope + STEEP / keep * by_pole
             return value, slope
 
-        found, value, used = minimise(function, x, budget, lambda value: value < enough)
+        found, _, used = minimise(function, x, budget, lambda value: value < enough)
         self.evaluations += used
-        return found if value < after(x)[0] and self.value(found) < 0.99 * low else x
+        less = after(found)[0] < TAKEN * after(x)[0]
+        return found if less and self.value(found) < 0.99 * low else x
 
     def _each(self, x):
         """The slowest pole of each loop that gains move, as a value."""

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""How soon the tip settles after a motion, for arms that are not what the file says; and the gradient by the gains.
 
-The feed-forward moves the arm of the file, :math:`M\ddot x + D\dot x + Kx = Bu` with :math:`x = (q, \delta)`, exactly.
-To an arm with the matrices :math:`M', K'` the same torque leaves the forces
+The feed-forward moves the arm of the file, :math:`M\ddot z + Kz = Bu` with :math:`z = (q, \delta)`. To an arm with the
+matrices :math:`M', K'` the same torque leaves the forces
 
-.. math:: f = (M - M')\,\ddot x + (K - K')\,x
+.. math:: f = (M - M')\,\ddot z + (K_{\cdot2} - K'_{\cdot2})\,\delta
 
 to the feedback. They are zero from the end of the motion on, and what they have excited decays. Along a quintic motion
 of a joint by `ANGLE` in `MOTION` locked periods, the bending is taken as quasi-static,
-:math:`\delta = -K_{22}^{-1}M_{21}\ddot q`. The sampled loop (`loop`) with gains K, linear in one configuration, goes on
-from sample to sample by :math:`X_{k+1} = AX_k + Sf_k`. It moves the tip by :math:`y_k = CX_k`, in units of the distance
-within which it is settled. What is made small is about the time until it is, in locked periods T from the motion's end
-on, with a motion j of each joint:
+:math:`\delta = -K_{22}^{-1}M_{21}\ddot q`. The change of the weight along the motion is left out, as is the difference
+in damping. The sampled loop (`loop`) with gains K, linear in one configuration, goes on from sample to sample by
+:math:`X_{k+1} = AX_k + Sf_k`. It moves the tip by :math:`y_k = CX_k`, in units of the distance within which it is
+settled. What is made small is about the time until it is, in locked periods T from the motion's end on, with a motion j
+of each joint:
 
 .. math:: J^3 = \frac{3}{T^3}\int_0^{6T} t^2\,\ln\Bigl(1 + \sum_j|y_j(t)|^2\Bigr)\,dt .
 
@@ -39,15 +40,15 @@ from .uncertain import richer
 ANGLE, MOTION, WATCHED = np.radians(75.0), 2.0, 6.0
 #: The tip has settled within this fraction of the reach [-].
 TOLERANCE = 1e-3
-#: At least so many steps per locked period.
+#: Samples are taken together as long as a locked period has at least so many steps.
 STEPS = 64
 #: Power of the time by which what is left is weighted: what comes last counts most.
 LATE = 2
 #: An arm with Coulomb friction is also looked at with these parts of the damper that its friction is at rest. What is
 #: left then counts less: the motion is larger than those that meet so much of it.
-STICKING, STICKS = (0.1, 0.3), 0.7
-#: Of the mean over all arms and configurations: the worst counts most.
-MEAN = 8.0
+RUBBING, RUBS = (0.1, 0.3), 0.7
+#: Of the sum over all arms and configurations: the worst counts most.
+POWER = 8.0
 
 
 class Residual:
@@ -145,33 +146,33 @@ class AfterMotion:
     ----------
     slowest : SlowestScheduled
         Scales the gains.
-    found : sequence of (int, Residual)
+    residuals : sequence of (int, Residual)
         Each with the number of its set of gains.
     """
 
-    def __init__(self, slowest, found):
-        self._slowest, self._found = slowest, found
+    def __init__(self, slowest, residuals):
+        self._slowest, self._residuals = slowest, residuals
 
     def __call__(self, x):
         """J, and its gradient by the scaled gains x."""
         K = self._slowest.gains(x)
-        rows = [residual(K[k]) for k, residual in self._found]
+        rows = [residual(K[k]) for k, residual in self._residuals]
         values = np.array([value for value, _ in rows])
         most = values.max()
         if not np.isfinite(most):
             return np.inf, np.zeros_like(x)
-        value = most * ((values / most) ** MEAN).sum() ** (1.0 / MEAN) if most else 0.0
+        value = most * ((values / most) ** POWER).sum() ** (1.0 / POWER) if most else 0.0
         slope = np.zeros_like(K)
-        for (k, _), (one, by_gains) in zip(self._found, rows, strict=True):
+        for (k, _), (one, by_gains) in zip(self._residuals, rows, strict=True):
             if one:
-                slope[k] += (one / value) ** (MEAN - 1.0) * by_gains
+                slope[k] += (one / value) ** (POWER - 1.0) * by_gains
         scale, free = self._slowest.scale, self._slowest.free
         return float(value), np.concatenate([(one * scale)[free] for one in slope])
 
     def settling(self, x):
         """Longest settling time of all, in locked periods."""
         K = self._slowest.gains(x)
-        return max(residual.settling(K[k]) for k, residual in self._found)
+        return max(residual.settling(K[k]) for k, residual in self._residuals)
 
 
 def residuals(nominal, q, sampling, uncertainty):
@@ -185,28 +186,29 @@ def residuals(nominal, q, sampling, uncertainty):
     snap = ANGLE * (720.0 * s - 360.0) / length**4
     M, K, _ = _matrices(build(arm), q)
     bent = -np.linalg.solve(K[n:, n:], M[n:, :n])  # by joint accelerations
-    x = np.vstack([np.zeros((n, n)), bent])
+    bending = np.vstack([np.zeros((n, n)), bent])
     moved = np.vstack([np.eye(n), np.zeros_like(bent)])
     (p0, p1), (k0, _) = uncertainty.payload, uncertainty.stiffness
-    parts = (0.0, *(STICKING if any(joint.friction.coulomb for joint in arm.joints) else ()))
+    parts = (0.0, *(RUBBING if any(joint.friction.coulomb for joint in arm.joints) else ()))
     found = []
     for payload, stiffness in ((p0, 1.0), (p1, 1.0), (1.0, k0)):
         plant = build(scaled(arm, payload, stiffness))
         try:
-            other, bending, A = _matrices(plant, q)
+            M_other, K_other, A = _matrices(plant, q)
         except ModelError:  # heavier than what rests there
             continue
-        forces = np.multiply.outer(acceleration, (M - other) @ moved + (K - bending) @ x)
-        forces += np.multiply.outer(snap, (M - other) @ x)
-        size = len(other)
-        push = np.vstack([np.zeros((size, size)), np.linalg.inv(other)])
+        by_acceleration = (M - M_other) @ moved + (K - K_other) @ bending
+        forces = np.multiply.outer(acceleration, by_acceleration)
+        forces += np.multiply.outer(snap, (M - M_other) @ bending)
+        size = len(M_other)
+        push = np.vstack([np.zeros((size, size)), np.linalg.inv(M_other)])
         push = sampled(A, push, sampling.period)[1]
         place = np.concatenate([q, plant.static_deflection(q)])
         tip = jacobian(lambda x, m=plant: m.tip_position(x[:n], x[n:]), place)
         tip /= TOLERANCE * arm.reach
         for part in parts:
             loop = sampled_loop(nominal, plant, q, sampling, sticking=part)
-            share = STICKS if part else 1.0
+            share = RUBS if part else 1.0
             found.append(Residual(loop, forces, push, tip, period, doublings, share))
     return found
 

@@ -6,9 +6,10 @@ The plants are those of `plants.VARIANTS`.
 The tip should come to rest where the plant's tip rests, bent by the plant's own weight, with every joint exactly at the
 end of the reference. A heavier payload sags more. Joint torques can't change this and need not: it is not an error.
 Joint errors and vibration are errors. The tip is settled when it is within `TOLERANCE` of the reach from that place,
-and stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`. The motion begins
-with the first torque, so that this does not return in a ramp as it does on a real arm before it is held
-(`Authority`): a motion of 0.2 s would begin with a tenth of its torque.
+and stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`.
+
+Torque does not return in a ramp here (`return_time` 0): a motion begins with the first torque. A real arm is held
+first, so that its ramp is over.
 
 Integration: dop853 is used if a few substeps are short enough for the highest mode and for the friction of light hubs.
 Friction damps a joint that reverses at the rate :math:`f_cH/v_0`, with the inverse H of the mass matrix and the
