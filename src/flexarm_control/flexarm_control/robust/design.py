@@ -594,6 +594,8 @@ class _Task:
             for one in loops
         ]
         search = self._together_search(eased, weights, found.sampling)
+        # A pole that hardly moves with the gains counts where less is asked of it.
+        reached = min(reached, -search.value(x))
         keep = max(KEEP * reached, min(reached, LEAST))
         budget = SOONER * self.settings.effort * min(1.0, PLACES / len(self.at))
         other = search.sooner(
