@@ -89,16 +89,18 @@ def test_the_value_is_the_time_until_the_tip_has_settled():
     assert np.isinf(one.settling(np.zeros((1, 1))))
 
 
-def test_what_is_left_is_that_of_the_linear_arm_in_continuous_time(r):
-    """R with 1.3 times its payload, against an integral of its own equations, with filters and delay negligible."""
+@pytest.mark.parametrize(("payload", "stiffness", "number"), [(1.3, 1.0, 1), (1.0, 0.9, 2)])
+def test_what_is_left_is_that_of_the_linear_arm_in_continuous_time(r, payload, stiffness, number):
+    """R as another arm, against an integral of that arm's equations, with filters and delay negligible."""
     model, q = r.model, np.zeros(1)
     infinite = {"joint_corner": np.inf, "modal_corner": 1e5, "torque_corner": np.inf}
     sampling = replace(r.sampling, period=2e-4, delay=0.0, **infinite)
     K = r.K.copy()
     K[:, 2:] = 0.0  # stiffness and damping of the joint alone
-    own, other = richer(model.arm.whole), scaled(richer(model.arm.whole), 1.3)
-    heavier = Uncertainty(payload=(1.0, 1.3), stiffness=(1.0, 1.0))
-    same, one, _ = residuals(model, q, sampling, heavier)
+    own, other = richer(model.arm.whole), scaled(richer(model.arm.whole), payload, stiffness)
+    differs = Uncertainty(payload=(1.0, payload), stiffness=(stiffness, 1.0))
+    found = residuals(model, q, sampling, differs)
+    same, one = found[0], found[number]
     A, M = [], []
     for arm in (own, other):
         plant = build(arm)
