@@ -16,8 +16,8 @@ of each joint:
 
 .. math:: J^3 = \frac{3}{T^3}\int_0^{6T} t^2\,\ln\Bigl(1 + \sum_j|y_j(t)|^2\Bigr)\,dt .
 
-Where the logarithm is one until :math:`t = sT`, and then zero, J = s. The gradient by the gains follows from that
-of the adjoint recursion
+Where the logarithm is one until :math:`t = sT`, and then zero, J = s. The gradient by the gains follows from
+the adjoint recursion
 
 .. math:: \Lambda_k = A^T\Lambda_{k+1} + C^T\frac{\partial J}{\partial y_k}, \qquad
     \frac{\partial J}{\partial A} = \sum_k\Lambda_{k+1}X_k^T, \qquad
@@ -30,10 +30,11 @@ import numpy as np
 
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import ModelError
-from flexarm_dynamics.linear import jacobian, linear_plant, sampled
+from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build
 
 from .loop import sampled_loop
+from .tip import Tip
 from .uncertain import richer
 
 #: A motion turns each joint by this [rad], in so many locked periods; then the tip is looked at for so many.
@@ -203,9 +204,7 @@ def residuals(nominal, q, sampling, uncertainty):
         size = len(M_other)
         push = np.vstack([np.zeros((size, size)), np.linalg.inv(M_other)])
         push = sampled(A, push, sampling.period)[1]
-        place = np.concatenate([q, plant.static_deflection(q)])
-        tip = jacobian(lambda x, m=plant: m.tip_position(x[:n], x[n:]), place)
-        tip /= TOLERANCE * arm.reach
+        tip = Tip(plant, q).J / (TOLERANCE * arm.reach)
         for part in parts:
             loop = sampled_loop(nominal, plant, q, sampling, sticking=part)
             share = RUBS if part else 1.0
