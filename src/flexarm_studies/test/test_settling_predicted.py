@@ -38,3 +38,12 @@ def test_the_tip_settles_when_the_design_predicts(number):
         assert run["settling_periods"] == pytest.approx(one.settling(found.sets[last]), abs=0.5), (
             name
         )
+
+
+def test_a_motion_begins_with_the_full_torque():
+    case = generator.arm(0)
+    loop = trial.loop_of(case, Setup({"rate": RATE, "stability_margin": -1e6}), VARIANTS["exact"])
+    authority, torque = loop.controller._authority, 1e-3 * np.ones(1)
+    authority.begin(np.zeros(1), False)
+    authority.send(torque, 1.0 / RATE, 1.0 / RATE)
+    assert authority.torque == pytest.approx(torque)
