@@ -507,6 +507,12 @@ LAWS = [
             "reached <= 0.0 or after(x)[0] < most",
             "reached <= 0.0",
         ),
+        (
+            "design",
+            "after a motion: an arm whose joints stick may be as slow as the slowest",
+            "own / reached if sticks else 1.0",
+            "1.0",
+        ),
     ),
     *of(
         "flexarm_control",

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from flexarm_control.robust import design as design_module
 from flexarm_control.robust import search as search_module
 from flexarm_control.robust.design import Settings, design, sampling_for
-from flexarm_control.robust.loop import sampled_loop
+from flexarm_control.robust.loop import ARM, MARGIN, STICKS, sampled_loop
 from flexarm_control.robust.settling import (
     ANGLE,
     MOTION,
@@ -71,16 +71,16 @@ def test_steps_of_several_samples_leave_what_single_ones_leave():
     short = Residual(loop, np.repeat(forces, 4, axis=0), push, tip, 0.4, 0).distance(
         np.zeros((n, 3))
     )
-    assert_allclose(long[:60], short[::4][:60], rtol=1e-9)
+    assert_allclose(long[:30], short[::4][:30], rtol=1e-9)
 
 
 def test_the_value_is_the_time_until_the_tip_has_settled():
     """A tip that is e - 1 away, squared, for two periods, and then at its place, has J = 2."""
     steps = 50
-    loop = SimpleNamespace(F=np.eye(2, k=-1), G=np.zeros((2, 1)), N=np.zeros((1, 2)), period=0.02)
+    loop = SimpleNamespace(F=np.eye(2, k=-1), G=np.zeros((2, 1)), N=np.zeros((1, 2)), period=0.01)
     one = Residual(loop, np.zeros((1, 1, 1)), np.zeros((1, 1)), np.ones((3, 1)), 1.0, 0)
     distance = np.where(np.arange(WATCHED * steps + 1) < 2 * steps, np.sqrt(np.e - 1.0), 0.0)
-    X = np.zeros((len(distance) + 1, 2, 1))
+    X = np.zeros((len(distance) + 1, 1, 2))
     X[1:, 0, 0] = distance / np.sqrt(3.0)
     one._moved = lambda K: ([(loop.F, one._S)], X)
     assert_allclose(one(np.zeros((1, 1)))[0], 2.0, rtol=0.02)
@@ -205,6 +205,31 @@ def test_a_slow_design_may_leave_more(r, monkeypatch):
     slow = design(r.model.arm, settings)
     monkeypatch.setattr(design_module, "MUCH", 0.6 * lasting(slow)[0])
     assert_allclose(design(r.model.arm, settings).K, slow.K, rtol=0.0)
+
+
+def test_loops_for_a_margin_are_eased_and_an_arm_that_sticks_keeps_of_its_own_decay(r):
+    joints = tuple(
+        replace(j, friction=replace(j.friction, coulomb=0.1)) for j in r.model.arm.joints
+    )
+    task = design_module._Task(replace(r.model.arm, joints=joints), r.design.settings, UNCERTAIN)
+    loops, weights = task._held(r.design.sampling, 1)
+    search = task._together_search(loops, weights, r.design.sampling)
+    x = search.slowest.scaled(r.design.sets)
+    own = [-search.slowest.worst([poles])[0] for poles in search.slowest.values(x)]
+    reached = 0.7 * min(v for v, loop in zip(own, loops, strict=True) if loop.kind == STICKS)
+    own_of_one = next(k for k, loop in enumerate(loops) if loop.kind == STICKS)
+    parts = list(task._parts(search, x, reached))
+    for part, v, loop in zip(parts, own, loops, strict=True):
+        margin = any(w in loop.name for w in ("no delay", "gain x", "delay ", "modes alone"))
+        assert loop.kind == (STICKS if "sticking" in loop.name else MARGIN if margin else ARM), (
+            loop.name
+        )
+        assert part == {MARGIN: 0.5, STICKS: pytest.approx(v / reached)}.get(loop.kind, 1.0)
+    # With that part a loop has now what was reached; one that has less is not asked more.
+    asked = replace(loops[own_of_one], fraction=loops[own_of_one].fraction * parts[own_of_one])
+    again = task._together_search([asked], weights[:1], r.design.sampling)
+    assert -again.value(x) == pytest.approx(reached, rel=1e-3)
+    assert set(task._parts(search, x, 10.0 * max(own))) == {1.0, 0.5}
 
 
 def test_gains_that_would_be_slower_than_asked_are_not_taken(r, monkeypatch):

@@ -8,7 +8,7 @@ from functools import cache
 
 from flexarm_dynamics.kernels import load, rigid
 
-from . import eigenvectors, law, limits, manifold, readings, responses, strains
+from . import eigenvectors, law, limits, manifold, readings, responses, steps, strains
 
 
 @cache
@@ -16,6 +16,16 @@ def compiled():
     """The compiled functions of all modules here."""
     sources = [
         load.source(module)
-        for module in (rigid, eigenvectors, law, limits, manifold, readings, responses, strains)
+        for module in (
+            rigid,
+            eigenvectors,
+            law,
+            limits,
+            manifold,
+            readings,
+            responses,
+            steps,
+            strains,
+        )
     ]
     return load.joined("control", sources, inline=("larger", "unit", "solve"))

@@ -31,6 +31,9 @@ from flexarm_dynamics.linear import linear_plant, sampled
 
 from ..low_pass import POLES, LowPass
 
+#: What a `Loop` stands for: an arm as it may be; a margin of gain, delay or modes; an arm whose joints stick.
+ARM, MARGIN, STICKS = "arm", "margin", "sticks"
+
 
 @dataclass(frozen=True)
 class Sampling:
@@ -59,6 +62,7 @@ class Loop:
     N: np.ndarray  # (3n + 2m, N): measurements
     period: float
     fraction: float = 1.0  # of the decay that is asked of it [-]
+    kind: str = ARM  # what it stands for
 
 
 def measured_amplitudes(nominal, plant):
@@ -68,7 +72,9 @@ def measured_amplitudes(nominal, plant):
     return map_.inverse @ (gains[:, None] * gauge_rows(plant, nominal.arm.gauges))
 
 
-def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, sticking=0.0):
+def sampled_loop(
+    nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, sticking=0.0, kind=ARM
+):
     """The `Loop` of a `plant` at rest in q (n,) [rad] under a control that knows the `nominal` model.
 
     Parameters
@@ -85,6 +91,8 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, s
         Of the decay that is asked of it [-].
     sticking : float
         Coulomb friction as a damper: 1.0 as steep as at rest, less as a larger movement meets it, 0.0 none [-].
+    kind : str
+        What the loop stands for: `ARM`, `MARGIN` or `STICKS`.
     """
     n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
     A, B = _plant(plant, np.asarray(q, float), sticking)
@@ -159,7 +167,7 @@ def sampled_loop(nominal, plant, q, sampling, gain=1.0, name="", fraction=1.0, s
     N[2 * n : 3 * n, at_w:at_v] = np.eye(n)
     N[3 * n : 3 * n + m, :size] = C[n:]
     N[3 * n + m :] = rate[n:]
-    return Loop(name, F, G, N, h, fraction)
+    return Loop(name, F, G, N, h, fraction, kind)
 
 
 def _plant(plant, q, sticking):

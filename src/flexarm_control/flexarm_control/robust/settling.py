@@ -24,6 +24,7 @@ the adjoint recursion
     \frac{\partial J}{\partial S} = \sum_k\Lambda_{k+1}f_k^T .
 
 Where a locked period has many samples, several are one step: A and S of two steps are :math:`A^2` and :math:`S + AS`.
+After the motion steps are longer still.
 """
 
 import numpy as np
@@ -33,6 +34,7 @@ from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build
 
+from ..kernels import compiled
 from .loop import sampled_loop
 from .tip import Tip
 from .uncertain import richer
@@ -41,8 +43,9 @@ from .uncertain import richer
 ANGLE, MOTION, WATCHED = np.radians(75.0), 2.0, 6.0
 #: The tip has settled within this fraction of the reach [-].
 TOLERANCE = 1e-3
-#: Samples are taken together as long as a locked period has at least so many steps.
-STEPS = 64
+#: Samples are taken together as long as a locked period has at least so many steps; after the motion two to the power
+#: of this many steps are one.
+STEPS, LONGER = 32, 1
 #: Power of the time by which what is left is weighted: what comes last counts most.
 LATE = 2
 #: An arm with Coulomb friction is also looked at with these parts of the damper that its friction is at rest. What is
@@ -68,43 +71,42 @@ class Residual:
     period : float
         Of the lowest mode, joints locked [s].
     doublings : int
-        A step is two to the power of this many samples.
+        A step of the motion is two to the power of this many samples; one after it, `LONGER` more.
     share : float
         Factor of J.
     """
 
     def __init__(self, loop, forces, push, tip, period, doublings, share=1.0):
-        self.loop, self._forces, self._doublings = loop, forces, doublings
-        self._share = share
+        self.loop, self._doublings, self._share = loop, doublings, share
+        self._forces = np.ascontiguousarray(forces.transpose(0, 2, 1))  # as rows, as the states
         self._S = np.zeros((len(loop.F), push.shape[1]))
         self._S[: len(push)] = push
         self._C = np.zeros((3, len(loop.F)))
         self._C[:, : tip.shape[1]] = tip
-        step = loop.period * 2.0**doublings / period
+        step = loop.period * 2.0 ** (doublings + LONGER) / period
         self._after = int(np.ceil(WATCHED / step))
         self._time = step * np.arange(self._after + 1)
         self._weight = (LATE + 1.0) * step * self._time**LATE
 
     def _moved(self, K):
-        """Matrices of each doubling, and the states X of all steps, (steps + 1, N, n)."""
+        """A and S of each doubling, and the states X of all steps as rows, (steps + 1, n, N)."""
         A, S = self.loop.F - self.loop.G @ (K @ self.loop.N), self._S
         doubled = [(A, S)]
-        for _ in range(self._doublings):
+        for _ in range(self._doublings + LONGER):
             A, S = A @ A, S + A @ S
             doubled.append((A, S))
-        count = len(self._forces)
-        X = np.zeros((count + self._after + 1, len(A), self._forces.shape[2]))
-        pushed = S @ self._forces
-        for k in range(count):
-            X[k + 1] = A @ X[k] + pushed[k]
-        for k in range(count, len(X) - 1):
-            np.matmul(A, X[k], out=X[k + 1])
+        count, n, _ = self._forces.shape
+        X = np.zeros((count + self._after + 1, n, len(A)))
+        A, S = doubled[self._doublings]
+        steps = compiled().steps
+        steps(np.ascontiguousarray(A.T), self._forces @ S.T, X[: count + 1])
+        steps(np.ascontiguousarray(doubled[-1][0].T), X[:0], X[count:])
         return doubled, X
 
     def distance(self, K):
         """Distance of the tip from its place over the tolerance, in steps from the end of the motion on."""
         X = self._moved(K)[1][len(self._forces) :]
-        return np.sqrt(((self._C @ X) ** 2).sum(axis=(1, 2)))
+        return np.sqrt(((X @ self._C.T) ** 2).sum(axis=(1, 2)))
 
     def settling(self, K):
         """Time from the end of the motion until the tip has settled, in locked periods; infinite: not while watched."""
@@ -117,27 +119,34 @@ class Residual:
         """J, and its gradient by K; infinite where the tip leaves the range of numbers."""
         with np.errstate(over="ignore", invalid="ignore"):
             doubled, X = self._moved(K)
-            first, A = len(self._forces), doubled[-1][0]
-            y = self._C @ X[first:]
+            first = len(self._forces)
+            y = X[first:] @ self._C.T
             square = (y**2).sum(axis=(1, 2))
             whole = self._weight @ np.log1p(square)
         if not 0.0 < whole < np.inf:
             return (0.0 if whole == 0.0 else np.inf), np.zeros_like(K)
         value = self._share * whole ** (1.0 / (LATE + 1.0))
         by_square = value / whole / (LATE + 1.0) * self._weight / (1.0 + square)
-        slope = self._C.T @ (y * (2.0 * by_square)[:, None, None])
+        slope = (y * (2.0 * by_square)[:, None, None]) @ self._C
         ahead = np.zeros_like(X)  # Lambda of each step
         ahead[-1] = slope[-1]
-        for k in range(len(X) - 2, -1, -1):
-            np.matmul(A.T, ahead[k + 1], out=ahead[k])
-            if k >= first:
-                ahead[k] += slope[k - first]
-        to_A = np.tensordot(ahead[1:], X[:-1], axes=((0, 2), (0, 2)))
-        to_S = np.tensordot(ahead[1 : first + 1], self._forces, axes=((0, 2), (0, 2)))
-        for A, S in doubled[-2::-1]:
+        back = compiled().steps_back
+        back(doubled[-1][0], slope[:-1], ahead[first:])
+        back(doubled[self._doublings][0], slope[:0], ahead[: first + 1])
+        to_A = _outer(ahead[first + 1 :], X[first:-1])
+        for A, _ in doubled[self._doublings : -1][::-1]:
+            to_A = to_A @ A.T + A.T @ to_A
+        to_A += _outer(ahead[1 : first + 1], X[:first])
+        to_S = _outer(ahead[1 : first + 1], self._forces)
+        for A, S in doubled[: self._doublings][::-1]:
             to_A = to_A @ A.T + A.T @ to_A + to_S @ S.T
             to_S = to_S + A.T @ to_S
         return float(value), -(self.loop.G.T @ to_A @ self.loop.N.T)
+
+
+def _outer(left, right):
+    """Sum of the products of all rows of some matrices with those of others."""
+    return left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2])
 
 
 class AfterMotion:

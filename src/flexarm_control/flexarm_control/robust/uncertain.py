@@ -9,7 +9,7 @@ from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.models.model import build
 
-from .loop import sampled_loop
+from .loop import ARM, MARGIN, STICKS, sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
@@ -153,39 +153,32 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
     }
     stated = next(iter(plants.values()))
     at_once = replace(sampling, delay=0.0)
-    kinds = {"": (sampling, 1.0), ", no delay": (at_once, UNLIKELY)}
+    kinds = {"": (sampling, 1.0, ARM), ", no delay": (at_once, UNLIKELY, MARGIN)}
     out, here = [], "" if first == 1 else f", at configuration {first}"
     for i, q in enumerate(at, first):
         for name, plant in (plants | edges).items():
-            for words, (samples, fraction) in kinds.items():
+            for words, (samples, fraction, kind) in kinds.items():
                 if words and name in edges:
                     continue
                 name_here = f"{name}{words}, at configuration {i}"
                 try:
-                    out.append(sampled_loop(nominal, plant, q, samples, 1.0, name_here, fraction))
+                    one = sampled_loop(
+                        nominal, plant, q, samples, 1.0, name_here, fraction, kind=kind
+                    )
                 except ModelError:  # heavier than what rests there
                     continue
-    for gain in uncertainty.gain:
-        out.append(
-            sampled_loop(nominal, stated, at[0], sampling, gain, f"gain x {gain:g}{here}", UNLIKELY)
-        )
+                out.append(one)
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
-    out.append(
-        sampled_loop(
-            nominal,
-            stated,
-            at[0],
-            later,
-            name=f"delay {1e3 * later.delay:.3g} ms{here}",
-            fraction=UNLIKELY,
-        )
-    )
+    margins = [(sampling, gain, f"gain x {gain:g}{here}") for gain in uncertainty.gain]
+    margins.append((later, 1.0, f"delay {1e3 * later.delay:.3g} ms{here}"))
+    for samples, gain, name in margins:
+        out.append(sampled_loop(nominal, stated, at[0], samples, gain, name, UNLIKELY, kind=MARGIN))
     own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))
     if own.n_modes < stated.n_modes:
         for i, q in enumerate(at, first):
-            for words, (samples, _) in kinds.items():
+            for words, (samples, *_) in kinds.items():
                 name = f"the file's modes alone{words}, at configuration {i}"
-                out.append(sampled_loop(nominal, own, q, samples, 1.0, name, UNLIKELY))
+                out.append(sampled_loop(nominal, own, q, samples, 1.0, name, UNLIKELY, kind=MARGIN))
     if sticking and any(joint.friction.coulomb for joint in arm.joints):
         out += _sticking(nominal, plants, at, sampling, first)
     return out
@@ -200,7 +193,9 @@ def _sticking(nominal, plants, at, sampling, first):
                 words = f"sticking, {part:g} of its friction, {name}, at configuration {i}"
                 if rests(plant, q):
                     out.append(
-                        sampled_loop(nominal, plant, q, sampling, 1.0, words, fraction, part)
+                        sampled_loop(
+                            nominal, plant, q, sampling, 1.0, words, fraction, part, STICKS
+                        )
                     )
     return out
 
