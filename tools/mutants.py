@@ -509,9 +509,15 @@ LAWS = [
         ),
         (
             "design",
-            "after a motion: an arm whose joints stick may be as slow as the slowest",
-            "own / reached if sticks else 1.0",
-            "1.0",
+            "after a motion: all loops are asked as much as before",
+            "if one.kind == MARGIN else one",
+            "if False else one",
+        ),
+        (
+            "settling",
+            "after a motion: steps are as long as during it, not so their times",
+            "range(self._doublings + self._longer)",
+            "range(self._doublings)",
         ),
     ),
     *of(

@@ -46,7 +46,8 @@ def r():
 def test_the_gradient_is_that_of_differences(doublings):
     rng = np.random.default_rng(doublings)
     N, n, h = 7, 2, 3
-    F = 0.35 * rng.standard_normal((N, N))
+    F = rng.standard_normal((N, N))
+    F *= 0.95 / np.abs(np.linalg.eigvals(F)).max()
     loop = SimpleNamespace(
         F=F, G=rng.standard_normal((N, n)), N=rng.standard_normal((4, N)), period=0.01
     )
@@ -60,18 +61,23 @@ def test_the_gradient_is_that_of_differences(doublings):
     assert value > 0.0
 
 
-def test_steps_of_several_samples_leave_what_single_ones_leave():
+@pytest.mark.parametrize(("period", "longer"), [(0.16, 0), (0.4, 1)])
+def test_steps_of_several_samples_leave_what_single_ones_leave(period, longer):
+    """A step of the motion is four samples; one after it eight, if a period has at least 16 of these."""
     rng = np.random.default_rng(0)
-    N, n = 6, 2
-    loop = SimpleNamespace(
-        F=0.4 * rng.standard_normal((N, N)), G=np.zeros((N, n)), N=np.zeros((3, N)), period=0.01
-    )
+    N, n, h = 6, 2, 0.16 / 128 if longer == 0 else 0.4 / 128
+    F = 0.4 * rng.standard_normal((N, N))
+    F *= 0.97 / np.abs(np.linalg.eigvals(F)).max()
+    loop = SimpleNamespace(F=F, G=np.zeros((N, n)), N=np.zeros((3, N)), period=h * (2 - longer))
     forces, push, tip = (rng.standard_normal(s) for s in ((3, 2, n), (4, 2), (3, 4)))
-    long = Residual(loop, forces, push, tip, 0.4, 2).distance(np.zeros((n, 3)))
-    short = Residual(loop, np.repeat(forces, 4, axis=0), push, tip, 0.4, 0).distance(
-        np.zeros((n, 3))
-    )
-    assert_allclose(long[:30], short[::4][:30], rtol=1e-9)
+    found = Residual(loop, forces, push, tip, period, 2).distance(np.zeros((n, 3)))
+    S, X, distance = np.vstack([push, np.zeros((2, 2))]), np.zeros((N, n)), []
+    for force in np.repeat(forces, 4, axis=0):
+        X = F @ X + S @ force
+    for _ in range(30):
+        distance.append(np.linalg.norm(tip @ X[:4]))
+        X = np.linalg.matrix_power(F, 4 * 2**longer) @ X
+    assert_allclose(found[:30], distance, rtol=1e-9)
 
 
 def test_the_value_is_the_time_until_the_tip_has_settled():
@@ -207,7 +213,9 @@ def test_a_slow_design_may_leave_more(r, monkeypatch):
     assert_allclose(design(r.model.arm, settings).K, slow.K, rtol=0.0)
 
 
-def test_loops_for_a_margin_are_eased_and_an_arm_that_sticks_keeps_of_its_own_decay(r):
+@pytest.fixture(scope="module")
+def rough(r):
+    """The same with Coulomb friction: the task, its search and the gains found without."""
     joints = tuple(
         replace(j, friction=replace(j.friction, coulomb=0.1)) for j in r.model.arm.joints
     )
@@ -215,21 +223,43 @@ def test_loops_for_a_margin_are_eased_and_an_arm_that_sticks_keeps_of_its_own_de
     loops, weights = task._held(r.design.sampling, 1)
     search = task._together_search(loops, weights, r.design.sampling)
     x = search.slowest.scaled(r.design.sets)
-    own = [-search.slowest.worst([poles])[0] for poles in search.slowest.values(x)]
-    reached = 0.7 * min(v for v, loop in zip(own, loops, strict=True) if loop.kind == STICKS)
-    own_of_one = next(k for k, loop in enumerate(loops) if loop.kind == STICKS)
-    parts = list(task._parts(search, x, reached))
-    for part, v, loop in zip(parts, own, loops, strict=True):
-        margin = any(w in loop.name for w in ("no delay", "gain x", "delay ", "modes alone"))
-        assert loop.kind == (STICKS if "sticking" in loop.name else MARGIN if margin else ARM), (
-            loop.name
-        )
-        assert part == {MARGIN: 0.5, STICKS: pytest.approx(v / reached)}.get(loop.kind, 1.0)
-    # With that part a loop has now what was reached; one that has less is not asked more.
-    asked = replace(loops[own_of_one], fraction=loops[own_of_one].fraction * parts[own_of_one])
-    again = task._together_search([asked], weights[:1], r.design.sampling)
-    assert -again.value(x) == pytest.approx(reached, rel=1e-3)
-    assert set(task._parts(search, x, 10.0 * max(own))) == {1.0, 0.5}
+    return SimpleNamespace(
+        task=task, loops=loops, search=search, x=x, found=task._sets(search, x, 0)
+    )
+
+
+def test_loops_are_there_for_an_arm_for_a_margin_or_stick(rough):
+    margins = ("no delay", "gain x", "delay ", "modes alone")
+    for loop in rough.loops:
+        margin = any(words in loop.name for words in margins)
+        kind = STICKS if "sticking" in loop.name else MARGIN if margin else ARM
+        assert loop.kind == kind, loop.name
+    assert {loop.kind for loop in rough.loops} == {ARM, MARGIN, STICKS}
+
+
+def test_the_further_search_keeps_four_fifths_of_the_slowest_decay_and_half_of_the_margins(
+    rough, monkeypatch
+):
+    left = residuals(rough.task.nominal, np.zeros(1), rough.found.sampling, UNCERTAIN)
+    after = AfterMotion(rough.search.slowest, [(0, one) for one in left])
+    monkeypatch.setattr(design_module, "MUCH", 0.9 * after(rough.x)[0])
+    monkeypatch.setattr(design_module, "LESS", 0.0)
+    asked = []
+    taken = search_module.Search.sooner
+    monkeypatch.setattr(
+        search_module.Search,
+        "sooner",
+        lambda self, *args: asked.append(self.slowest.loops) or taken(self, *args),
+    )
+    other = rough.task.sooner(lambda fraction, decay: None, rough.found)
+    assert other is not rough.found
+    assert after(rough.search.slowest.scaled(other.K))[0] < 0.85 * after(rough.x)[0]
+    before = rough.search.decays(rough.x)
+    now = rough.search.decays(rough.search.slowest.scaled(other.K))
+    for loop, one, new in zip(rough.loops, asked[0], now, strict=True):
+        eased = 0.5 if loop.kind == MARGIN else 1.0
+        assert one.fraction == eased * loop.fraction
+        assert new > 0.78 * eased * min(before), loop.name
 
 
 def test_gains_that_would_be_slower_than_asked_are_not_taken(r, monkeypatch):

@@ -28,7 +28,7 @@ from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
 from .held import held_loops
-from .loop import MARGIN, STICKS, Sampling
+from .loop import MARGIN, Sampling
 from .noise import Noise
 from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
 from .settling import AfterMotion, residuals
@@ -68,8 +68,8 @@ SLOW, TRIES, KEPT = 0.2, 6, 0.055
 #: gains that leave less, down to this part of it, in at most so many evaluations; in fewer for more configurations
 #: than these.
 MUCH, LESS, SOONER, PLACES = 3.5, 0.6, 800, 3
-#: The slowest pole of all loops then keeps this part of the decay that was reached; of an arm whose joints stick, that
-#: of its own loop. Of loops that are there for a margin, this part of what was asked is asked [-].
+#: The slowest pole of all loops then keeps this part of the decay that was reached. Of loops that are there for a
+#: margin, this part of what was asked is asked [-].
 KEEP, EASED = 0.8, 0.5
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
@@ -585,16 +585,18 @@ class _Task:
             for one in residuals(self.nominal, q, found.sampling, self.uncertainty)
         ]
         after, x = AfterMotion(whole.slowest, left), whole.slowest.scaled(found.K)
-        most, reached = MUCH / self.speed, -whole.value(x)
+        most, reached = MUCH / self.speed, min(whole.decays(x))
         if not left or reached <= 0.0 or after(x)[0] < most:
             return found
-        asked = [
-            replace(one, fraction=one.fraction * part)
-            for one, part in zip(loops, self._parts(whole, x, reached), strict=True)
+        eased = [
+            replace(one, fraction=EASED * one.fraction) if one.kind == MARGIN else one
+            for one in loops
         ]
-        search = self._together_search(asked, weights, found.sampling)
+        search = self._together_search(eased, weights, found.sampling)
         # A pole that hardly moves with the gains counts where less is asked of it.
-        reached = min(reached, -search.value(x))
+        reached = min(reached, *search.decays(x))
+        if reached <= 0.0:
+            return found
         keep = max(KEEP * reached, min(reached, LEAST))
         budget = SOONER * self.settings.effort * min(1.0, PLACES / len(self.at))
         other = search.sooner(
@@ -609,14 +611,6 @@ class _Task:
             return found
         used = found.evaluations + whole.evaluations + search.evaluations
         return self._sets(whole, other, used)
-
-    @staticmethod
-    def _parts(whole, x, reached):
-        """Of the decay that each loop is asked, the part that `sooner` asks of it beside `reached`."""
-        for loop, poles in zip(whole.slowest.loops, whole.slowest.values(x), strict=True):
-            own = -whole.slowest.worst([poles])[0]
-            sticks = loop.kind == STICKS and reached < own < np.inf
-            yield EASED if loop.kind == MARGIN else own / reached if sticks else 1.0
 
     def _held(self, sampling, count):
         """Loops at and between the configurations, and the weights of `count` sets of gains in each."""

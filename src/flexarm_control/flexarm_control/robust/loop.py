@@ -92,7 +92,7 @@ def sampled_loop(
     sticking : float
         Coulomb friction as a damper: 1.0 as steep as at rest, less as a larger movement meets it, 0.0 none [-].
     kind : str
-        What the loop stands for: `ARM`, `MARGIN` or `STICKS`.
+        What the loop stands for: `ARM` or `MARGIN`; with `sticking` it is `STICKS`.
     """
     n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
     A, B = _plant(plant, np.asarray(q, float), sticking)
@@ -167,7 +167,7 @@ def sampled_loop(
     N[2 * n : 3 * n, at_w:at_v] = np.eye(n)
     N[3 * n : 3 * n + m, :size] = C[n:]
     N[3 * n + m :] = rate[n:]
-    return Loop(name, F, G, N, h, fraction, kind)
+    return Loop(name, F, G, N, h, fraction, STICKS if sticking else kind)
 
 
 def _plant(plant, q, sticking):

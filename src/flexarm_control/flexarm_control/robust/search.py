@@ -27,9 +27,10 @@ AGAIN, APART = 240, 0.1
 PATIENCE, MORE = 3, 0.01
 #: Loops with more states get fewer evaluations.
 SIZE = 65
-#: What motions leave behind: width of the smooth maximum of the poles, and slope of the penalty on a decay below the
-#: least, over that.
-NARROW, STEEP = 0.003, 50.0
+#: What motions leave behind: width of the smooth maximum of the poles; weight of the square of what the decay is below
+#: the least, over that; and by how much more than the least is aimed at, since such a penalty leaves a little less.
+#: (Where poles meet, their slopes have no bound: a penalty in proportion ended searches.)
+NARROW, STEEP, AIM = 0.003, 500.0, 1.02
 #: Gains have to leave less than this part of what the others leave: linear loops predict it no better. Progress is
 #: reported after so many evaluations.
 TAKEN, REPORTED = 0.85, 20
@@ -96,6 +97,10 @@ class Search:
         """The slowest pole of all loops, with the penalties."""
         return self._with_penalty(self._each(x), x)
 
+    def decays(self, x):
+        """Decay of the slowest pole of each loop that gains move, a list; infinite where they move none [-]."""
+        return [-value for value in self._each(x)]
+
     def relaxed(self, x, kept=(), least=0.0):
         """The loops, of which those that limit the others are asked less, and their numbers; without loops at an end.
 
@@ -145,7 +150,7 @@ class Search:
         ndarray
             x itself, if none are found that keep the decay and leave less than `TAKEN` of what x leaves.
         """
-        slow, low, done = self._smooth(self.slowest.loops, NARROW), -keep, 0
+        slow, low, done = self._smooth(self.slowest.loops, NARROW), -AIM * keep, 0
 
         def function(x):
             nonlocal done
@@ -157,13 +162,14 @@ class Search:
             if not np.isfinite(value):
                 return np.inf, np.zeros_like(x)
             if pole > low:
-                value, slope = value + STEEP * (pole - low) / keep, slope + STEEP / keep * by_pole
+                over = (pole - low) / keep
+                value, slope = value + STEEP * over**2, slope + 2.0 * STEEP * over / keep * by_pole
             return value, slope
 
         found, _, used = minimise(function, x, budget, lambda value: value < enough)
         self.evaluations += used
         less = after(found)[0] < TAKEN * after(x)[0]
-        return found if less and self.value(found) < 0.99 * low else x
+        return found if less and self.value(found) < -0.99 * keep else x
 
     def _each(self, x):
         """The slowest pole of each loop that gains move, as a value."""

@@ -43,8 +43,8 @@ from .uncertain import richer
 ANGLE, MOTION, WATCHED = np.radians(75.0), 2.0, 6.0
 #: The tip has settled within this fraction of the reach [-].
 TOLERANCE = 1e-3
-#: Samples are taken together as long as a locked period has at least so many steps; after the motion two to the power
-#: of this many steps are one.
+#: Samples are taken together as long as a locked period has at least so many steps. Where it has, two to the power of
+#: this many steps are one after the motion.
 STEPS, LONGER = 32, 1
 #: Power of the time by which what is left is weighted: what comes last counts most.
 LATE = 2
@@ -71,7 +71,8 @@ class Residual:
     period : float
         Of the lowest mode, joints locked [s].
     doublings : int
-        A step of the motion is two to the power of this many samples; one after it, `LONGER` more.
+        A step of the motion is two to the power of this many samples; one after it also of `LONGER` more, if a period
+        then has half of `STEPS`.
     share : float
         Factor of J.
     """
@@ -83,7 +84,9 @@ class Residual:
         self._S[: len(push)] = push
         self._C = np.zeros((3, len(loop.F)))
         self._C[:, : tip.shape[1]] = tip
-        step = loop.period * 2.0 ** (doublings + LONGER) / period
+        step = loop.period * 2.0**doublings / period
+        self._longer = LONGER if STEPS * step <= 1.0 else 0
+        step *= 2.0**self._longer
         self._after = int(np.ceil(WATCHED / step))
         self._time = step * np.arange(self._after + 1)
         self._weight = (LATE + 1.0) * step * self._time**LATE
@@ -92,7 +95,7 @@ class Residual:
         """A and S of each doubling, and the states X of all steps as rows, (steps + 1, n, N)."""
         A, S = self.loop.F - self.loop.G @ (K @ self.loop.N), self._S
         doubled = [(A, S)]
-        for _ in range(self._doublings + LONGER):
+        for _ in range(self._doublings + self._longer):
             A, S = A @ A, S + A @ S
             doubled.append((A, S))
         count, n, _ = self._forces.shape

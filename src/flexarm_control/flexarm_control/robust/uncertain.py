@@ -9,11 +9,11 @@ from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.models.model import build
 
-from .loop import ARM, MARGIN, STICKS, sampled_loop
+from .loop import ARM, MARGIN, sampled_loop
 
 #: Configurations are drawn within this of straight [rad].
 WORKSPACE = 1.3
-#: Fraction of the decay that is asked of loops with another gain or delay.
+#: Fraction of the decay that is asked of loops for a margin: another gain or delay, the file's modes alone.
 UNLIKELY = 0.5
 #: Of an arm that sticks: parts of the damper that its Coulomb friction is at rest, as movements of several sizes meet
 #: it, and the fraction that is asked of each. At rest it creeps: friction over stiffness is its time.
@@ -153,11 +153,11 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
     }
     stated = next(iter(plants.values()))
     at_once = replace(sampling, delay=0.0)
-    kinds = {"": (sampling, 1.0, ARM), ", no delay": (at_once, UNLIKELY, MARGIN)}
+    timings = {"": (sampling, 1.0, ARM), ", no delay": (at_once, UNLIKELY, MARGIN)}
     out, here = [], "" if first == 1 else f", at configuration {first}"
     for i, q in enumerate(at, first):
         for name, plant in (plants | edges).items():
-            for words, (samples, fraction, kind) in kinds.items():
+            for words, (samples, fraction, kind) in timings.items():
                 if words and name in edges:
                     continue
                 name_here = f"{name}{words}, at configuration {i}"
@@ -176,7 +176,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
     own = build(scaled(nominal.arm.whole, 1.0, 1.0, d0))
     if own.n_modes < stated.n_modes:
         for i, q in enumerate(at, first):
-            for words, (samples, *_) in kinds.items():
+            for words, (samples, *_) in timings.items():
                 name = f"the file's modes alone{words}, at configuration {i}"
                 out.append(sampled_loop(nominal, own, q, samples, 1.0, name, UNLIKELY, kind=MARGIN))
     if sticking and any(joint.friction.coulomb for joint in arm.joints):
@@ -193,9 +193,7 @@ def _sticking(nominal, plants, at, sampling, first):
                 words = f"sticking, {part:g} of its friction, {name}, at configuration {i}"
                 if rests(plant, q):
                     out.append(
-                        sampled_loop(
-                            nominal, plant, q, sampling, 1.0, words, fraction, part, STICKS
-                        )
+                        sampled_loop(nominal, plant, q, sampling, 1.0, words, fraction, part)
                     )
     return out
 
