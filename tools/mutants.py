@@ -504,14 +504,14 @@ LAWS = [
         (
             "design",
             "after a motion: every design goes on",
-            "reached <= 0.0 or after(x)[0] < most",
-            "reached <= 0.0",
+            "min(decays) <= 0.0 or after(x)[0] < most",
+            "min(decays) <= 0.0",
         ),
         (
             "design",
             "after a motion: all loops are asked as much as before",
-            "if one.kind == MARGIN else one",
-            "if False else one",
+            "yield EASED if loop.kind == MARGIN else least",
+            "yield least",
         ),
         (
             "settling",

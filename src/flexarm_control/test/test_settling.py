@@ -237,6 +237,17 @@ def test_loops_are_there_for_an_arm_for_a_margin_or_stick(rough):
     assert {loop.kind for loop in rough.loops} == {ARM, MARGIN, STICKS}
 
 
+def test_loops_for_a_margin_are_eased_and_an_arm_that_moves_keeps_a_least_decay():
+    loops = [SimpleNamespace(kind=kind) for kind in (ARM, ARM, MARGIN, STICKS)]
+
+    def parts(*decays):
+        return list(design_module._parts(loops, decays))
+
+    assert parts(0.2, 0.5, 0.3, 0.4) == [1.0, 1.0, 0.5, 1.0]
+    # With 0.02 kept of all: 0.05 of what moves, or all that it has.
+    assert_allclose(parts(0.2, 0.03, 0.3, 0.02), [2.5, 1.5, 0.5, 1.0])
+
+
 def test_the_further_search_keeps_four_fifths_of_the_slowest_decay_and_half_of_the_margins(
     rough, monkeypatch
 ):

@@ -28,7 +28,7 @@ from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
 from .held import held_loops
-from .loop import MARGIN, Sampling
+from .loop import ARM, MARGIN, Sampling
 from .noise import Noise
 from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
 from .settling import AfterMotion, residuals
@@ -585,19 +585,19 @@ class _Task:
             for one in residuals(self.nominal, q, found.sampling, self.uncertainty)
         ]
         after, x = AfterMotion(whole.slowest, left), whole.slowest.scaled(found.K)
-        most, reached = MUCH / self.speed, min(whole.decays(x))
-        if not left or reached <= 0.0 or after(x)[0] < most:
+        most, decays = MUCH / self.speed, whole.decays(x)
+        if not left or min(decays) <= 0.0 or after(x)[0] < most:
             return found
         eased = [
-            replace(one, fraction=EASED * one.fraction) if one.kind == MARGIN else one
-            for one in loops
+            replace(one, fraction=part * one.fraction)
+            for one, part in zip(loops, _parts(loops, decays), strict=True)
         ]
         search = self._together_search(eased, weights, found.sampling)
         # A pole that hardly moves with the gains counts where less is asked of it.
-        reached = min(reached, *search.decays(x))
+        reached = min(decays + search.decays(x))
         if reached <= 0.0:
             return found
-        keep = max(KEEP * reached, min(reached, LEAST))
+        keep = _kept(reached)
         budget = SOONER * self.settings.effort * min(1.0, PLACES / len(self.at))
         other = search.sooner(
             x,
@@ -679,6 +679,23 @@ class _Task:
             sets.slope,
             sets.K,
         )
+
+
+def _kept(reached):
+    """The least decay that the search for gains that leave less keeps, of the least that was `reached` [-]."""
+    return max(KEEP * reached, min(reached, LEAST))
+
+
+def _parts(loops, decays):
+    """Of the decay that each loop is asked, the part that is asked of it in that search.
+
+    Less of loops that are there for a margin. The others of an arm that moves keep `LEAST`, where a loop that sticks or
+    one for a margin has less.
+    """
+    keep = _kept(min(decays))
+    for loop, own in zip(loops, decays, strict=True):
+        least = max(min(own, LEAST) / keep, 1.0) if loop.kind == ARM else 1.0
+        yield EASED if loop.kind == MARGIN else least
 
 
 def units(model, at, omega_1):
