@@ -129,9 +129,9 @@ def draw(file):
             at = low + height - 0.12 - LINE * i
             axes.text(left + 0.2, at, text, size=8.5, color=colour, **style)
     for package in PACKAGES:
-        for other in plain[package]:
+        for other in sorted(plain[package]):  # of a set, whose order differs from run to run
             _arrow(axes, boxes[package], boxes[other], "-")
-        for other in short[package] - core[package]:
+        for other in sorted(short[package] - core[package]):
             _arrow(axes, boxes[package], boxes[other], "--")
     axes.text(
         0, top - 0.3, "blue: without ROS      brown: with ROS      dashed: nodes/ only", size=8.5

@@ -164,7 +164,7 @@ def test_a_cancelled_goal_is_canceled_once_the_arm_has_stopped(line):
     home(line)
     bench, arm, client = line
     handle, _ = client.send(trajectory((60.0, 0.8)))
-    bench.wait_for("motion", lambda: arm.state.supervisor_state == CompositeState.TRACKING)
+    bench.wait_for("motion", lambda: arm.state.reference_position[0] > 0.0)
     handle.cancel_goal_async()
     status, result = client.result(handle)
     assert status == GoalStatus.STATUS_CANCELED

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear steps and their adjoint, compiled and as plain Python, beside products of matrices."""
+"""Linear steps, compiled and as plain Python, beside products of matrices."""
 
 import numpy as np
 import pytest
@@ -19,16 +19,3 @@ def test_steps_are_products_with_the_matrix_and_pushes_while_there_are_any(kerne
     for k in range(1, 6):
         state = state @ A + (pushes[k - 1] if k <= count else 0.0)
         assert_allclose(X[k], state, rtol=1e-12)
-
-
-@pytest.mark.parametrize("kernel", [steps, compiled()])
-@pytest.mark.parametrize("count", [0, 2, 5])
-def test_steps_back_begin_at_the_last_one(kernel, count):
-    draw = np.random.default_rng(count)
-    A, slopes = draw.standard_normal((4, 4)), draw.standard_normal((count, 2, 4))
-    ahead = np.full((6, 2, 4), np.nan)
-    ahead[-1] = state = draw.standard_normal((2, 4))
-    kernel.steps_back(A, slopes, ahead)
-    for k in range(4, -1, -1):
-        state = state @ A + (slopes[k] if k < count else 0.0)
-        assert_allclose(ahead[k], state, rtol=1e-12)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear steps of several states at once, and back: see `robust.settling` for what they are for."""
+"""Linear steps of several states at once: see `robust.settling` for what they are for."""
 
 
 def steps(A, pushes, X):
@@ -23,25 +23,3 @@ def steps(A, pushes, X):
                 x = X[k, c, j]
                 for i in range(X.shape[2]):
                     X[k + 1, c, i] += x * A[j, i]
-
-
-def steps_back(A, slopes, ahead):
-    r"""Fill `ahead` with :math:`\Lambda_k = \Lambda_{k+1}A + S_k` that come before its last one.
-
-    Parameters
-    ----------
-    A : ndarray, shape (N, N)
-    slopes : ndarray, shape (p, n, N)
-        S of the first ones; of the others there is none.
-    ahead : ndarray, shape (s, n, N)
-    """
-    for k in range(ahead.shape[0] - 2, -1, -1):
-        for c in range(ahead.shape[1]):
-            if k < slopes.shape[0]:
-                ahead[k, c] = slopes[k, c]
-            else:
-                ahead[k, c] = 0.0
-            for j in range(ahead.shape[2]):
-                x = ahead[k + 1, c, j]
-                for i in range(ahead.shape[2]):
-                    ahead[k, c, i] += x * A[j, i]

@@ -689,8 +689,8 @@ def _kept(reached):
 def _parts(loops, decays):
     """Of the decay that each loop is asked, the part that is asked of it in that search.
 
-    Less of loops that are there for a margin. The others of an arm that moves keep `LEAST`, where a loop that sticks or
-    one for a margin has less.
+    `EASED` of loops that are there for a margin. A loop of the moving arm keeps `LEAST`, or what it has, also where the
+    slowest of all loops is slower.
     """
     keep = _kept(min(decays))
     for loop, own in zip(loops, decays, strict=True):

@@ -71,8 +71,8 @@ class Residual:
     period : float
         Of the lowest mode, joints locked [s].
     doublings : int
-        A step of the motion is two to the power of this many samples; one after it also of `LONGER` more, if a period
-        then has half of `STEPS`.
+        A step of the motion is two to the power of this many samples. After the motion the power is higher by
+        `LONGER`, if a period has at least `STEPS` steps.
     share : float
         Factor of J.
     """
@@ -131,11 +131,11 @@ class Residual:
         value = self._share * whole ** (1.0 / (LATE + 1.0))
         by_square = value / whole / (LATE + 1.0) * self._weight / (1.0 + square)
         slope = (y * (2.0 * by_square)[:, None, None]) @ self._C
-        ahead = np.zeros_like(X)  # Lambda of each step
-        ahead[-1] = slope[-1]
-        back = compiled().steps_back
-        back(doubled[-1][0], slope[:-1], ahead[first:])
-        back(doubled[self._doublings][0], slope[:0], ahead[: first + 1])
+        last, steps = np.zeros_like(X), compiled().steps  # Lambda of each step, the last one first
+        last[0] = slope[-1]
+        steps(doubled[-1][0], np.ascontiguousarray(slope[-2::-1]), last[: self._after + 1])
+        steps(doubled[self._doublings][0], slope[:0], last[self._after :])
+        ahead = last[::-1]
         to_A = _outer(ahead[first + 1 :], X[first:-1])
         for A, _ in doubled[self._doublings : -1][::-1]:
             to_A = to_A @ A.T + A.T @ to_A
