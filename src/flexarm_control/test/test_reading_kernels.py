@@ -183,14 +183,16 @@ def test_rates_are_compared_if_one_is_given():
 def test_what_the_motion_does_not_explain_is_the_laws_residual(random):
     size = G + N + M
     low, corner = random.normal(size=(5, size)), 40.0
-    drive, load, bend = (random.normal(size=(G, k)) for k in (N, G, M))
+    drive, load, turn, bend = (random.normal(size=(G, k)) for k in (N, G, G, M))
     moved, residual = np.zeros(G + N), np.zeros((2, G))
-    COMPILED.not_explained(low, corner, drive, load, bend, moved, residual)
+    COMPILED.not_explained(low, corner, drive, load, turn, bend, moved, residual)
+    first = corner * (low[3] - low[4])
     second = corner**2 * (low[2] - 2.0 * low[3] + low[4])
     p = drive @ second[G : G + N] + bend @ low[4, G + N :]
     np.testing.assert_allclose(moved, second[: G + N], rtol=1e-12)
     np.testing.assert_allclose(residual[1], p, rtol=1e-10)
-    np.testing.assert_allclose(residual[0], low[4, :G] + load @ second[:G] + p, rtol=1e-10)
+    wanted = low[4, :G] + load @ second[:G] + turn @ first[:G] + p
+    np.testing.assert_allclose(residual[0], wanted, rtol=1e-10)
 
 
 @pytest.mark.parametrize("learns", [True, False])
@@ -223,26 +225,26 @@ def test_a_drift_is_low_passed_and_bounded_by_what_a_payload_may_do(random, lear
 def test_strains_are_high_passed_and_their_misfit_is_counted(random, first):
     moments, corner, k, keep = 2, 40.0, 0.2, 0.9
     low, force = random.normal(size=(5, G + N + M + moments * G)), random.normal(size=G)
-    slow, fast = random.normal(size=(3 + 2 * moments, G)), np.zeros((3 + 2 * moments, G))
-    second = corner**2 * (low[2] - 2.0 * low[3] + low[4])
-    young = [x[-moments * G :].reshape(moments, G) for x in (low[4], second)]
-    raw = np.vstack([low[4, :G], second[:G], force, *young])
-    was = np.vstack([raw[:3], np.zeros((2 * moments, G))]) if first else slow.copy()
+    slow, fast = random.normal(size=(4 + 3 * moments, G)), np.zeros((4 + 3 * moments, G))
+    read = low[4], corner * (low[3] - low[4]), corner**2 * (low[2] - 2.0 * low[3] + low[4])
+    young = [x[-moments * G :].reshape(moments, G) for x in read]
+    raw = np.vstack([*(x[:G] for x in read), force, *young])
+    was = np.vstack([raw[:4], np.zeros((3 * moments, G))]) if first else slow.copy()
     COMPILED.high_passed(low, corner, force, slow, fast, k, first)
     np.testing.assert_allclose(slow, was + k * (raw - was), rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(fast, raw - slow, rtol=1e-12)
 
-    project, load = random.normal(size=(2, G, G))
+    project, load, turn = random.normal(size=(3, G, G))
     groups = np.equal.outer(*[np.arange(G) // 2] * 2)
     sums, run, noise = random.random((2, G)), random.integers(0, 4, G), random.random(G)
-    strain, acceleration, p = fast[:3]
-    z = project @ strain + load @ acceleration
+    strain, rate, acceleration, p = fast[:4]
+    z = project @ strain + turn @ rate + load @ acceleration
     means = keep * sums + (1.0 - keep) * np.stack([(z + p) ** 2, z * z + p * p])
     misfit, total = means @ groups
     doubtful = (total > 4.0 * noise) & (misfit > 0.9 * total)
     counted = np.where(doubtful, run + 1, 0)
     limits = (2.0, 0.9, 3)
-    long = COMPILED.follow_misfit(fast, project, load, groups, sums, keep, run, noise, limits)
+    long = COMPILED.follow_misfit(fast, project, load, turn, groups, sums, keep, run, noise, limits)
     np.testing.assert_allclose(sums, means, rtol=1e-10)
     np.testing.assert_array_equal(run, counted)
     assert long == (counted >= 3).any()
@@ -250,10 +252,10 @@ def test_strains_are_high_passed_and_their_misfit_is_counted(random, first):
 
 def test_the_noise_of_the_law_is_summed_over_a_link(random):
     gauge, encoder = random.random(G), random.random(N)
-    drive, load = random.normal(size=(G, N)), random.normal(size=(G, G))
+    drive, load, turn = (random.normal(size=(G, k)) for k in (N, G, G))
     groups = np.equal.outer(*[np.arange(G) // 2] * 2)
-    noise = gauge + 16.0 * (load**2 @ gauge + drive**2 @ encoder)
-    found = COMPILED.noise_of_law(gauge, encoder, 16.0, drive, load, groups)
+    noise = gauge + 16.0 * (load**2 @ gauge + drive**2 @ encoder) + 4.0 * turn**2 @ gauge
+    found = COMPILED.noise_of_law(gauge, encoder, 4.0, drive, load, turn, groups)
     np.testing.assert_allclose(found, noise @ groups, rtol=1e-12)
 
 

@@ -11,8 +11,9 @@ DIFFERENCE, LARGE, FAST = 0, 1, 2
 #: Rows of what `zero_drift` keeps of each gauge: least bound, what the weight does, zero, low-passed residual, what the
 #: motion may do, residual less its zero, its bound, what is taken from the reading.
 LEAST, BY_WEIGHT, ZERO, SLOW, MOVING, LEFT, ALLOWED, CORRECTION = 0, 1, 2, 3, 4, 5, 6, 7
-#: Rows of what `strain_law` compares, before those of the moments: strain, its second derivative, and p.
-STRAIN, ACCELERATION, FORCE = 0, 1, 2
+#: Rows of what `strain_law` compares: strain, its first and second derivative, p, and the first of those since each
+#: moment: all strains, then all first, then all second derivatives.
+STRAIN, RATE, ACCELERATION, FORCE, SINCE = 0, 1, 2, 3, 4
 
 
 def low_passed(rows, weights, signal):
@@ -148,7 +149,7 @@ def pick_up(strain, position, middle, half, moments, now):
     return True
 
 
-def not_explained(low, corner, drive, load, bend, moved, residual):
+def not_explained(low, corner, drive, load, turn, bend, moved, residual):
     """Fill what the motion does to the strains, and what of them it does not explain.
 
     Parameters
@@ -157,7 +158,7 @@ def not_explained(low, corner, drive, load, bend, moved, residual):
         Of the `low_pass.LowPass` of strains, positions and forces.
     corner : float
         Its [rad/s].
-    drive, load, bend : ndarray, shape (g, n), (g, g), (g, m)
+    drive, load, turn, bend : ndarray, shape (g, n), (g, g), (g, g), (g, m)
         `zero_drift.law_matrices`.
     moved : ndarray, shape (g + n,)
         Filled with the second derivatives of strains and positions.
@@ -174,7 +175,8 @@ def not_explained(low, corner, drive, load, bend, moved, residual):
         for j in range(m):
             p += bend[i, j] * low[4, g + n + j]
         for j in range(g):
-            inertia += load[i, j] * moved[j]
+            rate = corner * (low[3, j] - low[4, j])
+            inertia += load[i, j] * moved[j] + turn[i, j] * rate
         residual[0, i], residual[1, i] = low[4, i] + inertia + p, p
 
 
@@ -231,16 +233,16 @@ def follow_drift(residual, moved, position, start, drive, load, doubted, rows, w
     return learns, wrong
 
 
-def noise_of_law(gauge, encoder, power, drive, load, groups):
+def noise_of_law(gauge, encoder, square, drive, load, turn, groups):
     """What noise makes of |z|^2 + |p|^2 in `strain_law`, summed over each gauge's link, shape (g,).
 
     Parameters
     ----------
     gauge, encoder : ndarray, shape (g,), (n,)
         Variances of low-passed strains and positions.
-    power : float
-        Fourth power of the corner.
-    drive, load : ndarray, shape (g, n), (g, g)
+    square : float
+        Of the corner.
+    drive, load, turn : ndarray, shape (g, n), (g, g), (g, g)
     groups : ndarray of bool, shape (g, g)
     """
     g, n = drive.shape
@@ -248,10 +250,10 @@ def noise_of_law(gauge, encoder, power, drive, load, groups):
     for i in range(g):
         of_gauges, of_encoders = 0.0, 0.0
         for j in range(g):
-            of_gauges += load[i, j] * load[i, j] * gauge[j]
+            of_gauges += (square * load[i, j] ** 2 + turn[i, j] ** 2) * gauge[j]
         for j in range(n):
             of_encoders += drive[i, j] * drive[i, j] * encoder[j]
-        noise[i] = gauge[i] + power * (of_gauges + of_encoders)
+        noise[i] = gauge[i] + square * (of_gauges + square * of_encoders)
     for i in range(g):
         for j in range(g):
             if groups[j, i]:
@@ -270,39 +272,43 @@ def high_passed(low, corner, force, slow, fast, weight, first):
         Its [rad/s].
     force : ndarray, shape (g,)
         p.
-    slow, fast : ndarray, shape (3 + 2 k, g)
-        Strains, second derivatives, forces, then strains since each of k moments, and their second derivatives.
+    slow, fast : ndarray, shape (4 + 3 k, g)
+        Strains, first and second derivatives, forces, then strains since each of k moments, and their derivatives.
     weight : float
         Of the readings in `slow`.
     first : bool
         Whether there were none before.
     """
     rows, g = slow.shape
-    moments = (rows - 3) // 2
+    moments = (rows - SINCE) // 3
     young = low.shape[1] - moments * g
     for i in range(g):
         for k in range(rows):
-            at = i if k < 2 else young + ((k - 3) % moments) * g + i
-            if k == FORCE:
+            kind, at = k, i
+            if k >= SINCE:
+                kind, at = (k - SINCE) // moments, young + ((k - SINCE) % moments) * g + i
+            if kind == FORCE:
                 raw = force[i]
-            elif k == STRAIN or 3 <= k < 3 + moments:
+            elif kind == STRAIN:
                 raw = low[4, at]
+            elif kind == RATE:
+                raw = corner * (low[3, at] - low[4, at])
             else:
                 raw = corner * corner * (low[2, at] - 2.0 * low[3, at] + low[4, at])
             if first:
-                slow[k, i] = raw if k < 3 else 0.0
+                slow[k, i] = raw if k < SINCE else 0.0
             slow[k, i] += weight * (raw - slow[k, i])
             fast[k, i] = raw - slow[k, i]
 
 
-def follow_misfit(fast, project, load, groups, sums, keep, run, noise, limits):
+def follow_misfit(fast, project, load, turn, groups, sums, keep, run, noise, limits):
     """Follow the misfit of strains and motion, and count for how long it is large; see `strain_law`.
 
     Parameters
     ----------
-    fast : ndarray, shape (3 or more, g)
+    fast : ndarray, shape (4 or more, g)
         As of `high_passed`.
-    project, load : ndarray, shape (g, g)
+    project, load, turn : ndarray, shape (g, g)
     groups : ndarray of bool, shape (g, g)
         Gauges of one link.
     sums : ndarray, shape (2, g)
@@ -325,7 +331,8 @@ def follow_misfit(fast, project, load, groups, sums, keep, run, noise, limits):
     for i in range(g):
         z, p = 0.0, fast[FORCE, i]
         for j in range(g):
-            z += project[i, j] * fast[STRAIN, j] + load[i, j] * fast[ACCELERATION, j]
+            z += project[i, j] * fast[STRAIN, j] + turn[i, j] * fast[RATE, j]
+            z += load[i, j] * fast[ACCELERATION, j]
         sums[0, i] = keep * sums[0, i] + (1.0 - keep) * (z + p) ** 2
         sums[1, i] = keep * sums[1, i] + (1.0 - keep) * (z * z + p * p)
     for i in range(g):

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Compares the strains with the motion of the joints, which bends the links, to find wrong signs and exchanged gauges.
 
-The second row of (2), without damping, multiplied by :math:`R K_2^{-1}`,
+The second row of (2), multiplied by :math:`R K_2^{-1}`,
 
-.. math:: z + p = 0, \qquad z = R\left(\delta + K_2^{-1}M_{22}\ddot\delta\right), \quad
+.. math:: z + p = 0, \qquad z = R\left(\delta + K_2^{-1}(M_{22}\ddot\delta + C_2\dot\delta)\right), \quad
           p = R K_2^{-1}\left(M_{21}\ddot q + f_2\right),
 
-gives the strains and their acceleration for a motion of the joints, whatever torque, friction or brake causes it, with
-:math:`\delta = W(\varepsilon - b)`. Strains, joint positions and :math:`f_2` pass the same `low_pass`, which gives
-their second derivatives. z and p pass the same high-pass filter, so that neither the bias of a gauge nor an unknown
-payload's weight counts. (`zero_drift` judges z and p without this filter.) The misfit of the readings
+gives the strains and their derivatives for a motion of the joints, whatever torque, friction or brake causes it, with
+:math:`\delta = W(\varepsilon - b)`. :math:`C_2` has the damping, and the Coriolis forces on links that bend while the
+arm turns. Strains, joint positions and :math:`f_2` pass the same `low_pass`, which gives their derivatives. z and p
+pass the same high-pass filter, so that neither the bias of a gauge nor an unknown payload's weight counts.
+(`zero_drift` judges z and p without this filter.) The misfit of the readings
 
 .. math:: r = \frac{\overline{|z + p|^2}}{\overline{|z|^2} + \overline{|p|^2}}
 
@@ -39,6 +40,7 @@ from math import exp
 import numpy as np
 
 from ... import kernels
+from ...kernels import strains
 from .low_pass import LowPass
 from .zero_drift import TOLERANCE, ZeroDrift, law_matrices
 
@@ -112,15 +114,14 @@ class StrainLaw:
         size += ONSETS * c.g * c.heavy
         self._now, self._low = np.zeros(size), LowPass(size, self.corner)
         self._moved, self._residual = np.zeros(c.g + c.n), np.zeros((2, c.g))
-        self._fast = np.zeros((3 + 2 * ONSETS, c.g))
+        self._fast = np.zeros((strains.SINCE + 3 * ONSETS, c.g))
         self._moments, self._kernels = ONSETS * c.heavy, kernels.compiled()
         self.reset()
 
     def reset(self):
         """Forget the past."""
-        c = self.channels
-        self._slow = np.zeros((3 + 2 * ONSETS, c.g))
-        self._history = np.zeros((self._kept, 3 + 2 * ONSETS, c.g))
+        self._slow = np.zeros_like(self._fast)
+        self._history = np.zeros((self._kept, *self._fast.shape))
         self._interval = INTERVAL
         self._inertia = None
         self.drift.reset()
@@ -183,7 +184,9 @@ class StrainLaw:
         """Set mass matrix and forces of the present configuration."""
         terms = self.model.terms(position, velocity)
         if self._inertia is None or self.channels.n > 1:  # that of an arm with a single joint stays
-            self.drive, self._load, self._bend = law_matrices(self.model, self._map, terms)
+            self.drive, self._load, self._turn, self._bend = law_matrices(
+                self.model, self._map, terms
+            )
         self._inertia, self._age = terms.M, 0.0
         first = self.channels.g + self.channels.n
         self._now[first : first + self.channels.m] = terms.f2
@@ -192,7 +195,7 @@ class StrainLaw:
         g, n, low, moved = self.channels.g, self.channels.n, self._low, self._moved
         residual, fast = self._residual, self._fast
         self._kernels.not_explained(
-            low.rows, low.corner, self.drive, self._load, self._bend, moved, residual
+            low.rows, low.corner, self.drive, self._load, self._turn, self._bend, moved, residual
         )
         self.drift.update(residual[0], moved, low.signal[g : g + n], dt)
         if not self.channels.heavy:
@@ -207,7 +210,7 @@ class StrainLaw:
         self._history[self._number % self._kept] = fast
         self._number += 1
         long = self._kernels.follow_misfit(
-            fast, self._project, self._load, self._groups, self._sums, exp(-dt / MEMORY), self._run,
+            fast, self._project, self._load, self._turn, self._groups, self._sums, exp(-dt / MEMORY), self._run,
             self._noise_of_law(), (CLEAR, MISFIT, PERSISTENT),
         )  # fmt: skip
         if self._number < self._kept or not long:
@@ -220,7 +223,7 @@ class StrainLaw:
         self._oldest = (i + 1) % ONSETS
         g, first = self.channels.g, self._young.start
         self._low.clear(slice(first + i * g, first + (i + 1) * g))
-        rows = [3 + i, 3 + ONSETS + i]
+        rows = strains.SINCE + i + ONSETS * np.arange(3)
         self._slow[rows] = fast[rows] = 0.0
         self._history[:, rows] = 0.0
 
@@ -231,13 +234,14 @@ class StrainLaw:
         gauge = left * np.maximum(c.noise[c.strain], self._noise) ** 2
         encoder = self._of_counts + left * self._of_position
         return self._kernels.noise_of_law(
-            gauge, encoder, w**4, self.drive, self._load, self._groups
+            gauge, encoder, w * w, self.drive, self._load, self._turn, self._groups
         )
 
     def _decide(self):
         """The hypothesis that fits much better, if there is one."""
-        strain, acceleration, p, *young = np.moveaxis(self._history, 1, 0)  # each (kept, g)
-        z = strain @ self._project.T + acceleration @ self._load.T
+        rows = np.moveaxis(self._history, 1, 0)  # each (kept, g)
+        read, p, since = rows[: strains.FORCE], rows[strains.FORCE], rows[strains.SINCE :]
+        z = self._explained(read).sum(axis=0)
         misfit, total = ((z + p) ** 2).mean(axis=0), (z * z + p * p).mean(axis=0)
         clear = total @ self._groups > CLEAR**2 * self._noise_of_law()
         misfit, total = misfit * clear, total * clear + ~clear
@@ -247,12 +251,11 @@ class StrainLaw:
         if not asked.any():
             return None
         # From the beginning, and from each moment.
-        T, change = self._hypothesis, self._hypothesis - np.eye(strain.shape[1])
-        rest = self._fit(strain @ T.transpose(0, 2, 1), acceleration @ T.transpose(0, 2, 1), p)
-        change = change.transpose(0, 2, 1)
-        for since, second in zip(young[:ONSETS], young[ONSETS:], strict=True):
-            fit = self._fit(strain + since @ change, acceleration + second @ change, p)
-            rest = np.minimum(rest, fit)
+        T = self._hypothesis.transpose(0, 2, 1)
+        change = T - np.eye(p.shape[1])
+        rest = self._fit(read[:, None] @ T, p)
+        for i in range(ONSETS):
+            rest = np.minimum(rest, self._fit(read[:, None] + since[i::ONSETS, None] @ change, p))
         gain = np.where(asked & (rest < FIT), nominal / rest, 0.0)
         best = int(np.argmax(gain))
         self.misfits = float(nominal[best]), float(rest[best])
@@ -268,11 +271,15 @@ class StrainLaw:
         self._best = best
         return best if self._same >= CONFIRMED else None
 
-    def _fit(self, strain, acceleration, p):
-        """Misfit of the strains of each hypothesis, (h, kept, g) each; infinite where inertias cancel."""
-        moved = acceleration @ self._load.T
-        z = strain @ self._project.T + moved
-        parts = (z + p) ** 2, z * z + p * p, strain**2, moved**2
+    def _explained(self, read):
+        """Parts of z by strains and their first and second derivatives, (3, ..., g) each."""
+        return np.stack([read[0] @ self._project.T, read[1] @ self._turn.T, read[2] @ self._load.T])
+
+    def _fit(self, read, p):
+        """Misfit of each hypothesis' strains and derivatives, (3, h, kept, g); infinite where inertias cancel."""
+        parts = self._explained(read)
+        z, moved = parts.sum(axis=0), parts[1:].sum(axis=0)
+        parts = (z + p) ** 2, z * z + p * p, read[0] ** 2, moved**2
         misfit, total, still, swing = (
             (self._concerned * part.mean(axis=1)).sum(axis=1) for part in parts
         )

@@ -4,7 +4,7 @@ r"""Finds gauges whose zero drifts, too slowly for a jump, and readings of a joi
 The law of `strain_law`, without its high pass, gives for each gauge the strain that the motion of the joints and the
 links' own inertia do not explain,
 
-.. math:: r = \varepsilon - R\delta_p, \qquad R\delta_p = -(R K_2^{-1}M_{22}\ddot\delta + p),
+.. math:: r = \varepsilon - R\delta_p, \qquad R\delta_p = -(R K_2^{-1}(M_{22}\ddot\delta + C_2\dot\delta) + p),
 
 r passes a low-pass filter with the time constant :math:`\tau` (`SLOW`). The result is compared with the zero
 :math:`r_0`, which is its mean over the first `LEARNT` seconds in which the arm hardly accelerates:
@@ -140,11 +140,18 @@ class ZeroDrift:
 
 
 def law_matrices(model, strain_map, terms):
-    """Strain on the gauges per joint acceleration (g, n), per their own acceleration (g, g), and per force (g, m)."""
+    """Strain on the gauges by what bends the links: `terms` through a `strain_map` of the `model`.
+
+    Returns
+    -------
+    drive, load, turn, force : ndarray, shape (g, n), (g, g), (g, g), (g, m)
+        Strain per joint acceleration, per second and per first derivative of the strains, and per modal force.
+    """
     n = model.n_joints
     to_strain = strain_map.rows @ np.linalg.inv(terms.K2)
     load = to_strain @ terms.M[n:, n:] @ strain_map.inverse
-    return to_strain @ terms.M[n:, :n], load, to_strain
+    turn = to_strain @ terms.C2 @ strain_map.inverse
+    return to_strain @ terms.M[n:, :n], load, turn, to_strain
 
 
 def _payload_changes(model, strain_map, payload):
@@ -167,7 +174,7 @@ def _payload_changes(model, strain_map, payload):
 def _at_rest(model, strain_map, q):
     """`law_matrices` at rest, the last one times f2: the weight's strain."""
     terms = model.terms(q, np.zeros(q.size))
-    drive, load, to_strain = law_matrices(model, strain_map, terms)
+    drive, load, _, to_strain = law_matrices(model, strain_map, terms)
     return drive, load, to_strain @ terms.f2
 
 
