@@ -480,8 +480,8 @@ LAWS = [
         (
             "settling",
             "after a motion: the other arm's bending is as stiff as the file's",
-            "(M - M_other) @ moved + (K - K_other) @ bending",
-            "(M - M_other) @ moved",
+            "self._forces(self._M - M, self._K - K)",
+            "self._forces(self._M - M, 0.0 * K)",
         ),
         (
             "settling",
@@ -518,6 +518,52 @@ LAWS = [
             "after a motion: steps are as long as during it, not so their times",
             "range(self._doublings + self._longer)",
             "range(self._doublings)",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "robust",
+        TESTS + "test_recovery.py",
+        (
+            "recovery",
+            "torque limits: none are taken",
+            "for most in (limit, np.inf * limit)",
+            "for most in (np.inf * limit, np.inf * limit)",
+        ),
+        (
+            "recovery",
+            "torque limits: the motion is as long as it likes",
+            "given = part * forces @ way, weight + part * torque, weight",
+            "given = forces @ way, weight + torque, weight",
+        ),
+        (
+            "design",
+            "torque limits: no design is made slower",
+            "if found.comes_back or slower.speed < SLOWEST:",
+            "if True:",
+        ),
+        (
+            "design",
+            "torque limits: the slowest design is taken",
+            "other.comes_back or other.recovery.limited < found.recovery.limited",
+            "True",
+        ),
+        (
+            "loop",
+            "torque limits: torques under way are not changed",
+            "effect[at : at + n] = np.eye(n)",
+            "effect[at : at + n] = 0.0",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "kernels",
+        TESTS + "test_recovery.py",
+        (
+            "steps",
+            "torque limits: the integral goes on",
+            "(X[k + 1, at] - X[k, at]) * wanted[i] < 0.0",
+            "(X[k + 1, at] - X[k, at]) * wanted[i] < -np.inf",
         ),
     ),
     *of(

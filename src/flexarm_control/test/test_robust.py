@@ -24,6 +24,7 @@ from flexarm_control.robust.design import (
     Settings,
     cancelled,
     design,
+    design_at,
     of_feedforward,
     units,
     what_limits,
@@ -241,7 +242,8 @@ def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed
     for design_, more in ((designed, set()), (found, alone)):
         assert {name.split(", at")[0] for name, _, _ in design_.slowest} & alone == more
     assert found.evaluations > designed.evaluations
-    assert fractions == sorted(fractions) and design_module.NEARBY in fractions[:-1]
+    nearby = design_module.FIRST * design_module.NEARBY
+    assert fractions == sorted(fractions) and nearby == pytest.approx(fractions[-3])
 
 
 def test_sets_of_gains_that_are_slow_go_on_from_gains_nearby_together(two_link, monkeypatch):
@@ -408,6 +410,7 @@ def test_an_arm_that_friction_lets_creep_swings_no_longer_than_one_without(desig
         ("stated", -1.0 + 60.0j, {"slope": 0.1}, "reach: torque hardly moves this mode of 9.55 Hz"),
         ("stated", -1.0 + 60.0j, {"noise": (0.5, 0.99)}, "noise: "),
         ("stated", -9.0 + 6.0j, {"decay": FASTEST}, "nothing: "),
+        ("stated", -9.0 + 6.0j, {"decay": FASTEST, "slowed": True}, "torque limits: "),
         ("stated", -1.0 + 60.0j, {}, "several loops at once: "),
     ],
 )
@@ -446,7 +449,7 @@ def test_each_speed_gets_the_decay_that_it_asks_at_the_noise_that_it_allows(monk
     """
     fractions, speeds, given = [], (0.3, 0.1), []
     monkeypatch.setattr(
-        trade_module, "design", lambda *words: given.append(words[-1]) or design(*words)
+        trade_module, "design_at", lambda *words: given.append(words[-1]) or design_at(*words)
     )
     found = trade(arm_file.load("R"), speeds, QUICK, progress=lambda f, _: fractions.append(f))
     assert [one.settings.speed for one in found] == sorted(speeds)

@@ -10,6 +10,8 @@ import pytest
 
 from flexarm_bringup import cli
 from flexarm_control.robust import cache
+from flexarm_control.robust import design as design_module
+from flexarm_control.robust.recovery import Recovery
 from flexarm_studies.commands.design import _yaml
 from flexarm_studies.loop import parameter_files, scenario
 from flexarm_studies.random_arms import generator
@@ -49,6 +51,10 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
     printed = capsys.readouterr().out
     assert "limited by          noise: " in printed
     assert "bears payload" in printed and f"written to {out}" in printed
+    assert re.search(
+        r"^  torque limits +payload x 1\.3: settled after 1\.\d locked periods", printed, re.M
+    )
+    assert "\n  speed " not in printed and "warning" not in printed
     nodes = parameter_files.load(out)
     controller, observer = nodes["controller"], nodes["observer"]
     assert controller["slow.type"] == "joint_pid" and len(controller["fast.gain"]) == 4
@@ -74,6 +80,21 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
     assert "exists already" in capsys.readouterr().err
 
 
+def test_a_design_that_is_slower_for_its_torque_limits_states_it(tmp_path, capsys, monkeypatch):
+    late = iter([np.inf, 6.0, 5.0, 7.0])
+    monkeypatch.setattr(design_module, "recovery", lambda *_: Recovery.of([(next(late), 1.0)]))
+    out = tmp_path / "made.yaml"
+    assert main(["design", "R", *LOOP, "--effort", "0.1", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    line = "  speed               0.5 in place of 1: an arm with faster gains would not come back"
+    assert line in printed and f"# {line}" in out.read_text()
+    assert "settled after 5 locked periods, without limits 1 locked periods" in printed
+    assert (
+        "warning: after a motion that takes nearly all its torque the arm swings for long"
+        in printed
+    )
+
+
 def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
     held, close = [], plt.close
     monkeypatch.setattr(plt, "close", lambda figure: held.append(figure) or close(figure))
@@ -83,6 +104,8 @@ def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
     found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert found["tip_stiffness_N_m"] > found["tip_stiffness_without_integral_N_m"] > 0.0
     assert 0.0 < found["phase_rad"] < 3.2 and found["settling_s"] > 0.0
+    assert found["speed"] == 1.0 and found["recovery"]["comes_back"]
+    assert found["recovery"]["limited"] >= found["recovery"]["unlimited"] > 0.0
     assert found["payload"][1] is None or found["payload"][1] > 1.3
     assert "<svg" in path.read_text()
     poles, decays, borne, noise = held[0].axes

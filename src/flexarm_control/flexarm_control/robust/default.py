@@ -61,7 +61,8 @@ PARAMETERS = (
     _factors("damping", "the links' damping"),
     _factors("gain", "the torque on its way to the arm"),
     parameter("design.speed", 1.0, "-", 0.0, 1.0, read_only=True).described(
-        "How fast the design is: less asks less decay, and makes less noise."
+        "How fast the design is at most: less asks less decay, and makes less noise; a design that would not come back"
+        " from its torque limits is slower."
     ),
     parameter("design.effort", 1.0, "-", 0.1, 100.0, read_only=True).described(
         "Of the search for gains: 5.0 takes five times as long."

@@ -30,6 +30,7 @@ from .decay import Slowest, SlowestScheduled, Wanted
 from .held import held_loops
 from .loop import ARM, MARGIN, Sampling
 from .noise import Noise
+from .recovery import Recovery, recovery
 from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
 from .settling import AfterMotion, residuals
 from .uncertain import (
@@ -55,6 +56,8 @@ TRANSPORT = 1e-3
 #: A pole is hardly in reach of the torque where one unit of all gains changes its value by less than this [-], and fast
 #: for the loop where the torque's delay turns it by more than this [rad].
 HARDLY, FAST = 1.0, 0.5
+#: Why a design has a lower speed than was asked.
+FROM_LIMITS = "an arm with faster gains would not come back from them in time"
 #: Where scheduled gains reach less of the decay than this, low passes are tried that end the torque's reach: of faster
 #: modes only their own damping is asked. Taken where the decay is so many times larger [-].
 POOR, WORTH = 0.25, 1.2
@@ -76,8 +79,13 @@ QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
 #: joints locked: a plan is integrated in steps of the fastest one [-].
 SPREAD = 2000.0
-#: Of the progress, the end of the usual search, of what is tried where that reaches little, and of what is nearby.
-USUAL, OTHERWISE, NEARBY = 0.6, 0.8, 0.9
+#: Where a loop does not come back from its torque limits (`recovery`), designs of these parts of the speed are made.
+SLOWER = (0.7, 0.5, 0.35)
+#: A lower speed counts as this one.
+SLOWEST = 0.05
+#: Of the progress, the end of the first design, which slower ones may follow. Of each design, the end of the usual
+#: search, of what is tried where that reaches little, and of what is nearby.
+FIRST, USUAL, OTHERWISE, NEARBY = 0.7, 0.6, 0.8, 0.9
 #: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
 #: can answer, friction would move a joint farther than this [rad]: cancelled, it would make such a joint hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
@@ -153,6 +161,10 @@ class Design:
         By how much one unit of all gains changes the value of the slowest pole [-].
     sets : ndarray, shape (k, n, 3n + 2m)
         One set of gains for all configurations, or one for each; see `flexarm_control.schedule`.
+    recovery : Recovery or None
+        From motions that take nearly all torque; None: not looked at.
+    slowed : bool
+        Whether its speed is lower than asked, because faster gains would not come back from the torque limits.
     """
 
     arm: object
@@ -170,6 +182,8 @@ class Design:
     noise: tuple = field(default=())
     slope: float = np.inf
     sets: np.ndarray | None = None
+    recovery: Recovery | None = None
+    slowed: bool = False
 
     def __post_init__(self):
         if self.sets is None:
@@ -210,6 +224,11 @@ class Design:
     def holds(self):
         """Whether all loops are stable."""
         return self.decay > 0.0
+
+    @property
+    def comes_back(self):
+        """Whether it comes back from the torque limits, as far as that was looked at."""
+        return self.recovery is None or self.recovery.comes_back
 
     def check(self):
         """Refuse a design that does not hold.
@@ -326,10 +345,13 @@ def what_limits(found):
         )
     if found.slope < HARDLY:
         return f"reach: torque hardly moves this mode of {hertz:.3g} Hz"
-    if max(found.noise, default=0.0) > 0.9 * max(found.settings.speed, 0.05) * NOISIEST:
+    speed = max(found.settings.speed, SLOWEST)
+    if max(found.noise, default=0.0) > 0.9 * speed * NOISIEST:
         return "noise: faster joints would pass more of it on to the torque"
-    if found.decay > 0.95 * max(found.settings.speed, 0.05) * FASTEST:
-        return "nothing: a higher speed asks more"
+    if found.decay > 0.95 * speed * FASTEST:
+        return (
+            "torque limits: " + FROM_LIMITS if found.slowed else "nothing: a higher speed asks more"
+        )
     return "several loops at once: what makes one of them faster makes another one slower"
 
 
@@ -404,6 +426,8 @@ def cancelled(model, at, late):
 def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     """Gains for an arm file's arm.
 
+    If the arm would not come back from its torque limits (`recovery`), slower gains are looked for: `SLOWER`.
+
     Parameters
     ----------
     arm : Arm
@@ -417,7 +441,8 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     Returns
     -------
     Design
-        The best that was found, also where it is not stable: see its `decay`.
+        The best that was found, also where it is not stable: see its `decay`. Its `settings` have the speed that was
+        taken.
 
     Raises
     ------
@@ -425,6 +450,24 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         Where the arm rests in no configuration, or has nothing to measure its bending by.
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
+    say = _Progress(progress)
+    found = design_at(arm, settings, uncertainty, say.part(0.0, FIRST), gains)
+    for k, part in enumerate(SLOWER):
+        slower = replace(settings, speed=part * settings.speed)
+        if found.comes_back or slower.speed < SLOWEST:
+            break
+        begin = FIRST + (1.0 - FIRST) * k / len(SLOWER)
+        now = say.part(begin, begin + (1.0 - FIRST) / len(SLOWER))
+        # From starts of its own: gains that ask for much torque would stay so.
+        other = design_at(arm, slower, uncertainty, now)
+        if other.holds and (other.comes_back or other.recovery.limited < found.recovery.limited):
+            found = replace(other, slowed=True)
+    say.part(0.0, 1.0)(1.0, found.decay)
+    return found
+
+
+def design_at(arm, settings, uncertainty, progress=None, gains=None):
+    """A `Design` of the speed that is given, whether or not it comes back from the torque limits; see `design`."""
     task, say = _Task(arm, settings, uncertainty), _Progress(progress)
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
@@ -495,7 +538,7 @@ class _Task:
         self.sampling, self.omega_c = sampling_for(nominal, self.at, settings)
         self.wanted = Wanted(self.omega_1, self.omega_c, own_damping(arm, uncertainty))
         self.scale = units(nominal, self.at, self.omega_1)
-        self.speed = max(settings.speed, 0.05)
+        self.speed = max(settings.speed, SLOWEST)
 
     def found(self, progress, gains, enough):
         """A set for each configuration; where these reach less than `enough`, one for all may be better."""
@@ -642,7 +685,10 @@ class _Task:
         slowest = Slowest(loops, self._wanted(corner), self.scale)
         noise = Noise(slowest, self.nominal, samples, self.speed * NOISIEST, self.omega_1)
         late = samples.delay + 0.5 * samples.period + 1.0 / samples.joint_corner + POLES / corner
-        starts = [start(self.nominal, at, self.scale, a, late, corner) for a in STARTS]
+        firm = [self.speed * a for a in STARTS]
+        if self.speed < 1.0 and any(self.arm.gravity):  # soft joints may not hold the weight
+            firm += STARTS
+        starts = [start(self.nominal, at, self.scale, a, late, corner) for a in firm]
         handicap = 1.0 if np.isinf(factor) else SLUGGISH
         search = Search(slowest, noise, self.speed * FASTEST, handicap, samples)
         return search, [slowest.scaled(K) for K in starts]
@@ -678,6 +724,9 @@ class _Task:
             tuple(sets.noise.tolist()),
             sets.slope,
             sets.K,
+            recovery(self.nominal, self.at, sets.sampling, self.uncertainty, sets.K)
+            if sets.decay > 0.0
+            else None,
         )
 
 

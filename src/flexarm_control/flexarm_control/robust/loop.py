@@ -19,6 +19,9 @@ first order with the corner of `slow.bandwidth` and `fast.bandwidth` (`flexarm_c
 all of this, and the control :math:`u = -K\,m`,
 
 .. math:: X_{k+1} = F X_k + G u_k, \qquad m = N X = (q, r_q, -w, \hat\delta, r_\delta) .
+
+What leaves the filters and is sent is :math:`v_k = V X_k + D u_k`. If a limit changes it by :math:`\Delta v`, this adds
+:math:`E\,\Delta v` to the next state (`Loop.sent`, `through`, `effect`).
 """
 
 from dataclasses import dataclass
@@ -63,6 +66,9 @@ class Loop:
     period: float
     fraction: float = 1.0  # of the decay that is asked of it [-]
     kind: str = ARM  # what it stands for
+    sent: np.ndarray | None = None  # (n, N): with through, the torque that is sent
+    through: np.ndarray | None = None  # (n, n)
+    effect: np.ndarray | None = None  # (N, n): what a change of the sent torque does
 
 
 def measured_amplitudes(nominal, plant):
@@ -118,7 +124,7 @@ def sampled_loop(
     slope = (1.0 - keep) / h
     rate[:, :size] = slope[:, None] * C
     rate[measured:, size:at_w] = np.eye(p - measured)
-    F, G = np.zeros((total, total)), np.zeros((total, n))
+    F, G, effect = np.zeros((total, total)), np.zeros((total, n)), np.zeros((total, n))
     F[:size, :size] = sampled(A, B, h)[0]
     F[size:at_w] = (keep[:, None] * rate)[measured:]
     F[size:at_w, :size] -= (slope[:, None] * C)[measured:]
@@ -149,8 +155,7 @@ def sampled_loop(
             at = total - n * age
             F[:size, at : at + n] += matrix
         else:
-            F[:size] += matrix @ out
-            G[:size] += matrix @ through
+            effect[:size] += matrix
 
     add(end, whole)
     if split:
@@ -160,14 +165,17 @@ def sampled_loop(
         if age > 1:
             F[at : at + n, at + n : at + 2 * n] = np.eye(n)
         else:
-            F[at : at + n], G[at : at + n] = out, through
+            effect[at : at + n] = np.eye(n)
+    F += effect @ out
+    G += effect @ through
     N = np.zeros((3 * n + 2 * m, total))
     N[:n, :size] = C[:n]
     N[n : 2 * n] = rate[:n]
     N[2 * n : 3 * n, at_w:at_v] = np.eye(n)
     N[3 * n : 3 * n + m, :size] = C[n:]
     N[3 * n + m :] = rate[n:]
-    return Loop(name, F, G, N, h, fraction, STICKS if sticking else kind)
+    kind = STICKS if sticking else kind
+    return Loop(name, F, G, N, h, fraction, kind, out, through, effect)
 
 
 def _plant(plant, q, sticking):

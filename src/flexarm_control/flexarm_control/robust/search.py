@@ -8,7 +8,8 @@ from scipy.linalg import eigh
 
 from .nonsmooth import minimise
 
-#: Starts: natural frequency of the joints over omega_1.
+#: Starts: natural frequency of the joints over omega_1, times the speed. From stiffer ones a search for a slow design
+#: ends at once, with gains that ask for much torque.
 STARTS = (0.5, 0.15)
 #: Weight of the gains' size against the slowest pole.
 SMALL_GAINS = 1e-6

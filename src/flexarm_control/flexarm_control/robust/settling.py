@@ -190,38 +190,77 @@ class AfterMotion:
 
 def residuals(nominal, q, sampling, uncertainty):
     """The `Residual` of each arm of which payload or stiffness alone differs, in configuration q (n,) [rad]."""
-    n, arm = nominal.n_joints, richer(nominal.arm.whole)
+    arm = richer(nominal.arm.whole)
     period = 2.0 * np.pi / nominal.frequencies(q, locked=True)[0]
     doublings = max(0, int(np.log2(max(period / STEPS / sampling.period, 1.0))))
-    step, length = sampling.period * 2.0**doublings, MOTION * period
-    s = np.minimum((np.arange(int(np.ceil(length / step))) + 0.5) * step / length, 1.0)
-    acceleration = ANGLE * (60.0 * s - 180.0 * s**2 + 120.0 * s**3) / length**2
-    snap = ANGLE * (720.0 * s - 360.0) / length**4
-    M, K, _ = _matrices(build(arm), q)
-    bent = -np.linalg.solve(K[n:, n:], M[n:, :n])  # by joint accelerations
-    bending = np.vstack([np.zeros((n, n)), bent])
-    moved = np.vstack([np.eye(n), np.zeros_like(bent)])
+    motion = Motion(build(arm), q, period, sampling.period * 2.0**doublings)
     (p0, p1), (k0, _) = uncertainty.payload, uncertainty.stiffness
     parts = (0.0, *(RUBBING if any(joint.friction.coulomb for joint in arm.joints) else ()))
     found = []
     for payload, stiffness in ((p0, 1.0), (p1, 1.0), (1.0, k0)):
         plant = build(scaled(arm, payload, stiffness))
         try:
-            M_other, K_other, A = _matrices(plant, q)
+            forces, push = motion.leaves(plant, sampling.period)
         except ModelError:  # heavier than what rests there
             continue
-        by_acceleration = (M - M_other) @ moved + (K - K_other) @ bending
-        forces = np.multiply.outer(acceleration, by_acceleration)
-        forces += np.multiply.outer(snap, (M - M_other) @ bending)
-        size = len(M_other)
-        push = np.vstack([np.zeros((size, size)), np.linalg.inv(M_other)])
-        push = sampled(A, push, sampling.period)[1]
         tip = Tip(plant, q).J / (TOLERANCE * arm.reach)
         for part in parts:
             loop = sampled_loop(nominal, plant, q, sampling, sticking=part)
             share = RUBS if part else 1.0
             found.append(Residual(loop, forces, push, tip, period, doublings, share))
     return found
+
+
+class Motion:
+    """The motion of each joint of the file's arm that ends in one configuration, and the forces that it takes.
+
+    Parameters
+    ----------
+    model : ArmModel
+        One mode richer than the file's.
+    q : ndarray, shape (n,)
+        [rad]
+    period : float
+        Of the lowest mode, joints locked [s].
+    step : float
+        Of the motion [s].
+
+    Attributes
+    ----------
+    torque : ndarray, shape (k, n, n)
+        Joint torques (last) in each step of the motion of each joint [N m].
+    """
+
+    def __init__(self, model, q, period, step):
+        n, length = model.n_joints, MOTION * period
+        s = np.minimum((np.arange(int(np.ceil(length / step))) + 0.5) * step / length, 1.0)
+        self._acceleration = ANGLE * (60.0 * s - 180.0 * s**2 + 120.0 * s**3) / length**2
+        self._snap = ANGLE * (720.0 * s - 360.0) / length**4
+        self._q, (self._M, self._K, _) = q, _matrices(model, q)
+        bent = -np.linalg.solve(self._K[n:, n:], self._M[n:, :n])  # by joint accelerations
+        self._bending = np.vstack([np.zeros((n, n)), bent])
+        self._moved = np.vstack([np.eye(n), np.zeros_like(bent)])
+        self.torque = self._forces(self._M, self._K)[:, :n].transpose(0, 2, 1)
+
+    def _forces(self, M, K):
+        """Forces (k, h, n) of an arm with these matrices in each step of the motion of each joint."""
+        by_acceleration = M @ self._moved + K @ self._bending
+        forces = np.multiply.outer(self._acceleration, by_acceleration)
+        return forces + np.multiply.outer(self._snap, M @ self._bending)
+
+    def leaves(self, plant, period):
+        """Forces (k, h, n) that its torque leaves to the feedback of a `plant`, and what they do in a sample.
+
+        The latter, (2h, h), is the change of the plant's state by one of each force for a `period` [s].
+
+        Raises
+        ------
+        ModelError
+            Where the plant does not rest there.
+        """
+        M, K, A = _matrices(plant, self._q)
+        push = np.vstack([np.zeros_like(M), np.linalg.inv(M)])
+        return self._forces(self._M - M, self._K - K), sampled(A, push, period)[1]
 
 
 def _matrices(model, q):

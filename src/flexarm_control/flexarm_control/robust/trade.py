@@ -3,14 +3,15 @@
 
 from dataclasses import replace
 
-from .design import Settings, design
+from .design import Settings, design_at
+from .uncertain import Uncertainty
 
 
 def trade(arm, speeds, settings=None, uncertainty=None, progress=None):
     """A `Design` for each of the `speeds`, from the slowest on; each search also starts from the gains of the last one.
 
     A faster design asks for more decay and allows more noise, so that the gains of a slower one are never worse than a
-    start of its own.
+    start of its own. None is replaced by a slower one for its torque limits.
 
     Parameters
     ----------
@@ -28,6 +29,7 @@ def trade(arm, speeds, settings=None, uncertainty=None, progress=None):
     list of Design
     """
     settings, found, gains = settings or Settings(), [], None
+    uncertainty = uncertainty or Uncertainty()
     speeds = sorted(speeds)
     for i, speed in enumerate(speeds):
 
@@ -36,6 +38,6 @@ def trade(arm, speeds, settings=None, uncertainty=None, progress=None):
 
         one = replace(settings, speed=speed)
         say = None if progress is None else of_all
-        found.append(design(arm, one, uncertainty, say, gains))
+        found.append(design_at(arm, one, uncertainty, say, gains))
         gains = found[-1].K if found[-1].holds else gains
     return found

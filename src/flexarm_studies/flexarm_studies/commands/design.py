@@ -104,7 +104,7 @@ def add_arguments(parser):
 def design(options):
     """Run ``design``."""
     from flexarm_control.robust.card import card
-    from flexarm_control.robust.design import Settings
+    from flexarm_control.robust.design import FROM_LIMITS, Settings
     from flexarm_control.robust.design import design as find
     from flexarm_control.robust.trade import trade
     from flexarm_control.robust.uncertain import Uncertainty
@@ -144,11 +144,19 @@ def design(options):
     found = find(arm, settings, uncertainty, progress)
     found.check()
     bears = card(found)
-    text = controller_file(options.arm, found, card_lines(found, bears), command(options))
+    lines = card_lines(found, bears)
+    if found.slowed:
+        lines.append(
+            f"  speed               {found.settings.speed:.3g} in place of {settings.speed:.3g}: {FROM_LIMITS}"
+        )
+    text = controller_file(options.arm, found, lines, command(options))
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text, encoding="utf-8")
-    lines = card_lines(found, bears)
+    if not found.comes_back:
+        lines.append(
+            "warning: after a motion that takes nearly all its torque the arm swings for long; move it more slowly"
+        )
     cycles = _limit_cycles(found, arm, settings.delay)
     lines += [f"warning: {cycle.text}" for cycle in cycles]
     lines += ["", f"written to {out}" if out else text]
@@ -186,6 +194,10 @@ def _result(found, bears):
         "limited_by": what_limits(found),
         "left_rad_s": list(found.left),
         "noise": list(found.noise),
+        "speed": found.settings.speed,
+        "recovery": None
+        if found.recovery is None
+        else asdict(found.recovery) | {"comes_back": found.comes_back},
         "gain": list(bears.gain),
         "payload": list(bears.payload),
         "stiffness": list(bears.stiffness),
@@ -220,7 +232,7 @@ def _speeds(options):
 #: Columns of the table of `--speeds`.
 COLUMNS = (
     "speed", "worst decay [1/s]", "settling [s]", "gain x", "payload x", "delay [ms]", "phase margin [deg]",
-    "noise [%]",
+    "noise [%]", "comes back from torque limits",
 )  # fmt: skip
 
 
@@ -242,6 +254,7 @@ def _trade(options, figure, designs):
                 _number(1e3 * bears.delay),
                 float(np.degrees(bears.phase)),
                 100.0 * max(found.noise),
+                "-" if found.recovery is None else "yes" if found.comes_back else "no",
             )
             for found, bears in rows
         ),
@@ -250,7 +263,7 @@ def _trade(options, figure, designs):
         from .design_figure import draw_trade
 
         lines += ["", f"figure {draw_trade(rows, figure)}"]
-    result = [{"speed": found.settings.speed} | _result(found, bears) for found, bears in rows]
+    result = [_result(found, bears) for found, bears in rows]
     show(options, _finite(result), lines, allow_nan=False)
     return 0
 
@@ -291,6 +304,7 @@ def card_lines(found, bears):
         f"  bears delay         {_number(1e3 * bears.delay)} ms",
         f"  phase margin        {np.degrees(bears.phase):.2g} deg",
         f"  noise in the torque {', '.join(f'{100.0 * share:.2g} %' for share in found.noise)} of the limit, rms",
+        f"  torque limits       {_recovery(found)}",
     ]
     if found.left:
         listed = ", ".join(f"{omega / (2.0 * np.pi):.3g} Hz" for omega in found.left)
@@ -298,6 +312,22 @@ def card_lines(found, bears):
             f"  left to themselves  {listed}: no torque reaches these modes, or no gauge sees them"
         )
     return lines
+
+
+def _recovery(found):
+    """How the arm comes back from its torque limits, in words."""
+    from flexarm_control.robust.recovery import SHARE, WATCHED
+
+    if found.recovery is None:
+        return "not looked at: no link bends, a joint has no limit, or the weight takes all torque"
+    with_, without = (
+        f"{periods:.2g} locked periods" if np.isfinite(periods) else f"more than {WATCHED:g}"
+        for periods in (found.recovery.limited, found.recovery.unlimited)
+    )
+    return (
+        f"payload x {found.uncertainty.payload[1]:g}: settled after {with_}, without limits {without}, after motions"
+        f" that take {SHARE:g} of them"
+    )
 
 
 def _number(value):
