@@ -22,6 +22,7 @@ from flexarm_control.robust.design import (
     KICK,
     NOISIEST,
     Settings,
+    SlowPole,
     cancelled,
     design,
     design_at,
@@ -29,7 +30,7 @@ from flexarm_control.robust.design import (
     units,
     what_limits,
 )
-from flexarm_control.robust.loop import Sampling, sampled_loop
+from flexarm_control.robust.loop import ARM, STICKS, Sampling, sampled_loop
 from flexarm_control.robust.nonsmooth import minimise
 from flexarm_control.robust.search import Search, nearby, start
 from flexarm_control.robust.trade import trade
@@ -240,7 +241,7 @@ def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed
     assert found.sampling == designed.sampling and found.uncertainty.edges
     alone = {"payload x 1.3, stiffness x 1", "payload x 1, stiffness x 0.9"}
     for design_, more in ((designed, set()), (found, alone)):
-        assert {name.split(", at")[0] for name, _, _ in design_.slowest} & alone == more
+        assert {row.name.split(", at")[0] for row in design_.slowest} & alone == more
     assert found.evaluations > designed.evaluations
     nearby = design_module.FIRST * design_module.NEARBY
     assert fractions == sorted(fractions) and nearby == pytest.approx(fractions[-3])
@@ -383,12 +384,12 @@ def test_the_paper_s_arm_has_a_quarter_of_its_bending_frequency_in_the_worst_cas
     assert designed.holds and designed.decay > 0.25
     assert max(designed.noise) < 0.035
     # The decay is the least of all loops over what is asked, and each loop's pole is one of its own.
-    assert_allclose(-max(v for _, _, v in designed.slowest), designed.decay, rtol=1e-12)
+    assert_allclose(-max(row.value for row in designed.slowest), designed.decay, rtol=1e-12)
     nominal = build(designed.arm)
     loops = uncertain_loops(
         nominal, designed.configurations, designed.sampling, designed.uncertainty
     )
-    for loop, (name, pole, _) in zip(loops, designed.slowest, strict=True):
+    for loop, (name, pole, *_) in zip(loops, designed.slowest, strict=True):
         s = np.log(eigenvalues(loop, designed.K)[1]) / loop.period
         assert loop.name == name and np.abs(s - pole).min() < 1e-6 * abs(pole)
 
@@ -398,14 +399,14 @@ def test_an_arm_that_friction_lets_creep_swings_no_longer_than_one_without(desig
     arm = designed.arm
     rough = tuple(replace(j, friction=replace(j.friction, coulomb=0.5)) for j in arm.joints)
     found = design(replace(arm, joints=rough), QUICK)
-    slowest = max(v for name, _, v in found.slowest if "sticking" not in name)
+    slowest = max(row.value for row in found.slowest if row.kind != STICKS)
     assert found.holds and -slowest > 0.85 * designed.decay
 
 
 @pytest.mark.parametrize(
     ("name", "pole", "change", "words"),
     [
-        ("sticking, at configuration 1", -0.1 + 0.1j, {}, "friction: a joint that sticks creeps"),
+        ("a joint", -0.1 + 0.1j, {"kind": STICKS}, "friction: a joint that sticks creeps"),
         ("stated", -1.0 + 300.0j, {}, "delay: the torque for this mode of 47.7 Hz is"),
         ("stated", -1.0 + 60.0j, {"slope": 0.1}, "reach: torque hardly moves this mode of 9.55 Hz"),
         ("stated", -1.0 + 60.0j, {"noise": (0.5, 0.99)}, "noise: "),
@@ -415,8 +416,15 @@ def test_an_arm_that_friction_lets_creep_swings_no_longer_than_one_without(desig
     ],
 )
 def test_the_card_says_why_the_slowest_pole_is_no_faster(designed, name, pole, change, words):
+    change = dict(change)
     noise = tuple(NOISIEST * f for f in change.pop("noise", (0.1, 0.1)))
-    one = {"decay": 0.1, "slope": 3.0, "noise": noise, "slowest": ((name, pole, -0.1),)} | change
+    kind = change.pop("kind", ARM)
+    one = {
+        "decay": 0.1,
+        "slope": 3.0,
+        "noise": noise,
+        "slowest": (SlowPole(name, pole, -0.1, kind),),
+    } | change
     assert what_limits(replace(designed, **one)).startswith(words)
 
 
@@ -552,8 +560,8 @@ def test_a_rigid_arm_gives_way_at_its_joints_alone():
     assert np.isinf(bears.tip_stiffness) and 0.0 < bears.tip_stiffness_proportional < 1e5
     assert 0.0 < bears.settling < 5.0
     assert len(poles(found)) == len(found.slowest)
-    for (name, _, s), (same, slowest, _) in zip(poles(found), found.slowest, strict=True):
-        assert name == same and np.abs(s - slowest).min() < 1e-6
+    for (name, _, s), row in zip(poles(found), found.slowest, strict=True):
+        assert name == row.name and np.abs(s - row.pole).min() < 1e-6
 
 
 def test_a_mode_that_no_torque_reaches_is_left_to_itself():

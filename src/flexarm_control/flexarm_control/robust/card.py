@@ -98,7 +98,7 @@ def card(design):
     period = sampling.period
     latest = limit(lambda late: stable(delay=late * period), sampling.delay / period, LATEST)
     phase = limit(lambda angle: stable(phase=angle), 0.0, np.pi)
-    slowest = min(-pole.real for _, pole, _ in design.slowest)
+    slowest = min(-row.pole.real for row in design.slowest)
     tips = [Tip(plants[1.0, 1.0], q) for q in design.configurations]
     n, m, more = nominal.n_joints, nominal.n_modes, plants[1.0, 1.0]
     seen = measured_amplitudes(nominal, more)

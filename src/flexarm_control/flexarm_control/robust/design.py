@@ -28,7 +28,7 @@ from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
 from .held import held_loops
-from .loop import ARM, MARGIN, Sampling
+from .loop import ARM, MARGIN, STICKS, Sampling
 from .noise import Noise
 from .recovery import Recovery, recovery
 from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
@@ -135,6 +135,15 @@ class Settings:
             object.__setattr__(self, "delay", 1.0 / self.rate + TRANSPORT)
 
 
+class SlowPole(NamedTuple):
+    """The slowest pole of a loop, relative to what is asked of it."""
+
+    name: str  # of the loop
+    pole: complex  # [1/s]
+    value: float  # minus its decay over what is asked of it [-]
+    kind: str = ARM  # of the loop
+
+
 @dataclass(frozen=True)
 class Design:
     """Gains, and what they were found to do.
@@ -151,8 +160,8 @@ class Design:
         Frequency up to which torque reaches a mode [rad/s].
     configurations : ndarray, shape (k, n)
         [rad]
-    slowest : tuple
-        Of each loop: name, slowest pole [1/s], its value.
+    slowest : tuple of SlowPole
+        Of each loop.
     left : tuple of float
         Frequencies of modes that no gain moves, at the first configuration [rad/s].
     noise : tuple of float
@@ -192,11 +201,12 @@ class Design:
     @property
     def reached(self):
         """The least decay over what is asked, of the arms with other payloads and stiffnesses alone [-]."""
-        return -max(
-            value
-            for name, _, value in self.slowest
-            if name.startswith("payload") and "no delay" not in name
-        )
+        return -max(row.value for row in self.slowest if row.kind == ARM)
+
+    @property
+    def worst(self):
+        """The `SlowPole` of the loop that is the slowest of all, relative to what is asked of it."""
+        return max(self.slowest, key=lambda row: row.value)
 
     @property
     def scheduled(self):
@@ -325,7 +335,7 @@ def observer_parameters(sampling):
 
 def in_the_way(found):
     """Which loop no gains were found for, and by which pole, in words."""
-    name, pole, _ = max(found.slowest, key=lambda row: row[2])
+    name, pole, *_ = found.worst
     return (
         f"no gains hold all of it: the best found lets a pole at {abs(pole) / (2.0 * np.pi):.3g} Hz grow at"
         f" {pole.real:.3g} 1/s with {name}"
@@ -334,9 +344,9 @@ def in_the_way(found):
 
 def what_limits(found):
     """Why the slowest pole of a design that holds is no faster, in words."""
-    name, pole, _ = max(found.slowest, key=lambda row: row[2])
+    pole = found.worst.pole
     hertz, lag = abs(pole) / (2.0 * np.pi), _lag(found, pole)
-    if "sticking" in name and abs(pole) < found.omega_1:
+    if found.worst.kind == STICKS and abs(pole) < found.omega_1:
         return "friction: a joint that sticks creeps to its place, and only the integral moves it"
     if lag > FAST:
         return (
@@ -362,7 +372,7 @@ def _lag(found, pole):
 
 def what_helps(found):
     """What to try, for the slowest pole of a design that does not hold."""
-    _, pole, _ = max(found.slowest, key=lambda row: row[2])
+    pole = found.worst.pole
     if _lag(found, pole) > FAST:
         return (
             "sample faster or shorten the delay: this pole is too fast for the loop; a rotor_inertia in the arm file"
@@ -520,7 +530,7 @@ class _Sets(NamedTuple):
     @property
     def decay(self):
         """Of the slowest pole, over what is wanted [-]."""
-        return -max(row[2] for row in self.rows)
+        return -max(row.value for row in self.rows)
 
 
 class _Task:
@@ -698,12 +708,12 @@ class _Task:
         slowest, rows, left, slopes = search.slowest, [], [], []
         for one in slowest.values(x):
             v, slope, _, s, unmoved = slowest.worst([one])
-            rows.append((one.loop.name, complex(s), float(v)))
+            rows.append(SlowPole(one.loop.name, complex(s), float(v), one.loop.kind))
             slopes.append(float(np.linalg.norm(slope)))
             left += [round(abs(s), 1) for loop, s in unmoved if loop is slowest.loops[0]]
         K = slowest.gains(x).reshape(-1, *self.scale.shape)
         noise = np.max([search.noise.shares(one) for one in K], axis=0)
-        slope = slopes[int(np.argmax([row[2] for row in rows]))]
+        slope = slopes[int(np.argmax([row.value for row in rows]))]
         return _Sets(K, search.sampling, tuple(rows), tuple(sorted(set(left))), noise, slope, used)
 
     def design(self, sets):

@@ -189,7 +189,8 @@ def _result(found, bears):
         "decay": found.decay,
         "omega_1_rad_s": found.omega_1,
         "slowest": [
-            {"loop": name, "pole": [s.real, s.imag], "value": v} for name, s, v in found.slowest
+            {"loop": row.name, "pole": [row.pole.real, row.pole.imag], "value": row.value}
+            for row in found.slowest
         ],
         "limited_by": what_limits(found),
         "left_rad_s": list(found.left),
@@ -270,7 +271,7 @@ def _trade(options, figure, designs):
 
 def worst_decay(found):
     """Decay of the pole that is slowest relative to its required decay [1/s]."""
-    return -max(found.slowest, key=lambda row: row[2])[1].real
+    return -found.worst.pole.real
 
 
 def _factors(option, text):
@@ -285,7 +286,7 @@ def card_lines(found, bears):
     """The properties of a design, in words."""
     from flexarm_control.robust.design import what_limits
 
-    name, pole, _ = max(found.slowest, key=lambda row: row[2])
+    name, pole, *_ = found.worst
     hertz = found.omega_1 / (2.0 * np.pi)
     lines = [
         f"{found.arm.name}: first frequency with the joints locked {hertz:.3g} Hz; {len(found.slowest)} loops at"

@@ -43,7 +43,7 @@ def draw_trade(rows, path):
         (decay, factors), (margins, noise) = axes
         decay.plot(
             speed,
-            [-max(f.slowest, key=lambda r: r[2])[1].real for f in found],
+            [-f.worst.pole.real for f in found],
             "o-",
             color=DESIGNED,
         )
@@ -141,9 +141,9 @@ def _poles(axes, found):
 
 def _decays(axes, found):
     """Decay of the slowest pole of each loop over its required decay."""
-    names = [name for name, _, _ in found.slowest]
+    names = [row.name for row in found.slowest]
     fractions = [fraction for _, fraction, _ in poles(found)]
-    values = [-value for _, _, value in found.slowest]
+    values = [-row.value for row in found.slowest]
     colours = [KINDS[_kind(*row)] for row in zip(names, fractions, strict=True)]
     rows = np.arange(len(names))
     axes.barh(rows, values, color=colours, height=0.6)
