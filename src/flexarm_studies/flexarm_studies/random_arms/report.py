@@ -275,7 +275,7 @@ def _share(right):
     if not right:
         return None
     count = sum(map(bool, right))
-    return f"{count} of {len(right)} ({100.0 * count / len(right):.0f} %)"
+    return f"{count} of {len(right)} ({100.0 * count / len(right):.3g} %)"
 
 
 def reasons(rows):
