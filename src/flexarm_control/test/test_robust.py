@@ -412,6 +412,7 @@ def test_an_arm_that_friction_lets_creep_swings_no_longer_than_one_without(desig
         ("stated", -1.0 + 60.0j, {"noise": (0.5, 0.99)}, "noise: "),
         ("stated", -9.0 + 6.0j, {"decay": FASTEST}, "nothing: "),
         ("stated", -9.0 + 6.0j, {"decay": FASTEST, "slowed": True}, "torque limits: "),
+        ("stated", -1.0 + 60.0j, {"noise": (0.5, 0.99), "slowed": True}, "torque limits: "),
         ("stated", -1.0 + 60.0j, {}, "several loops at once: "),
     ],
 )

@@ -494,6 +494,11 @@ def test_what_is_wanted_of_designs_is_counted():
     assert found == "0 of 1 (0 %)"
 
 
+def test_a_share_of_less_than_all_is_not_100_percent():
+    assert report._share([True] * 599 + [False]) == "599 of 600 (99.8 %)"
+    assert report._share([True] * 600) == "600 of 600 (100 %)"
+
+
 def test_what_noise_alone_makes_is_measured_beside_a_noisy_run():
     case = arm_like_r()
     setup = CONTROLLERS["pid"](case)

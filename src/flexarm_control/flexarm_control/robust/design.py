@@ -356,12 +356,14 @@ def what_limits(found):
     if found.slope < HARDLY:
         return f"reach: torque hardly moves this mode of {hertz:.3g} Hz"
     speed = max(found.settings.speed, SLOWEST)
-    if max(found.noise, default=0.0) > 0.9 * speed * NOISIEST:
+    noisy = max(found.noise, default=0.0) > 0.9 * speed * NOISIEST
+    enough = found.decay > 0.95 * speed * FASTEST
+    if found.slowed and (noisy or enough):  # a lower speed also allows less noise
+        return f"torque limits: {FROM_LIMITS}"
+    if noisy:
         return "noise: faster joints would pass more of it on to the torque"
-    if found.decay > 0.95 * speed * FASTEST:
-        return (
-            "torque limits: " + FROM_LIMITS if found.slowed else "nothing: a higher speed asks more"
-        )
+    if enough:
+        return "nothing: a higher speed asks more"
     return "several loops at once: what makes one of them faster makes another one slower"
 
 
