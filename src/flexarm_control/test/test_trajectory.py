@@ -781,7 +781,7 @@ def test_other_motions_are_slowed_down(rows, stop, why):
     at(generator, 0.0)
     speed = generator.path.near(round(stop * S), 0.0, generator._near) and generator._near[1, 0]
     generator.stop(round(stop * S), 1e3, given=False)
-    assert generator.path.speed(generator.path.start_ns, 0.3) < 0.9, why
+    assert generator.path.pace(generator.path.start_ns, 0.3) < 0.9, why
     assert abs(at(generator, stop + 0.3)[1]) < abs(speed) or speed < 0.2
 
 

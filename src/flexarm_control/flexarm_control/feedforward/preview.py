@@ -27,13 +27,17 @@ the control's own model is taken. If that has none either, the motion that `mode
 the feed-forward knows no more than the control, the manifold remains, for which the torque may not suffice. The reason
 is in `Preparation.note`.
 
-In a stop, the plan can't be followed. Its bending beside the slow manifold is a vibration, which goes on in its own
-time and ends with the plan. The regulator damps it as the joints slow down. Let s_ref be the manifold's motion along
-the stop, and s_path that along the trajectory. The simulated arm is then held to
+In a stop, or where the speed of the trajectory is scaled on the way, the plan can't be followed. Its bending beside the
+slow manifold is a vibration, which goes on in its own time and ends with the plan. The regulator damps it as the joints
+slow down. Let s_ref be the manifold's motion along the slowed trajectory, and s_path that along the trajectory at full
+speed. The simulated arm is then held to
 
 .. math:: s_{ref}(t) + \dot s(t)\,\bigl(s_{plan}(t) - s_{path}(t)\bigr),
 
-where :math:`\dot s`, from 1 to 0, is the stop's time law (module `trajectory.path`); the torque changes likewise.
+where :math:`\dot s`, 1 at first, is the rate of the trajectory's time (modules `trajectory.path`,
+`trajectory.scaling`); the torque changes likewise. If the plan were dropped at once instead, the simulated arm would be
+left with its vibration: two random arms were lost when their speed was halved on the way. A trajectory whose speed is
+scaled from its start on follows the manifold.
 """
 
 from dataclasses import dataclass, replace
@@ -180,7 +184,7 @@ class Preview(ModelFeedforward):
         return Plan(count * period, motion, torque, period)
 
     def _planned(self, prepared, path, stamp_ns):
-        if prepared is None or prepared.plan is None or path.scaled:
+        if prepared is None or prepared.plan is None or not path.began_unscaled:
             return None  # a plan at another speed is no motion of the arm
         elapsed_ns = stamp_ns - path.followed.start_ns
         return prepared.plan if 0 <= elapsed_ns < prepared.plan.duration * SECOND else None
@@ -193,7 +197,7 @@ class Preview(ModelFeedforward):
         if path is way:
             return state, torque
         stop, motion = (self._on_manifold(At(p, stamp_ns, offset)) for p in (path, way))
-        left = path.speed(stamp_ns, offset)
+        left = path.pace(stamp_ns, offset)
         return stop[0] + left * (state - motion[0]), stop[1] + left * (torque - motion[1])
 
 

@@ -115,8 +115,8 @@ class Path:
 
     """
 
-    #: Whether the path's time differs from the arm's.
-    scaled = False
+    #: Whether the path's time differs from the arm's, and whether it was the arm's at its start.
+    scaled, began_unscaled = False, True
     #: The piece that a path ends in: its last state, held.
     END = -1
 
@@ -207,8 +207,8 @@ class Path:
         """Time of this path at a stamp, from its start [s]."""
         return (stamp_ns - self.start_ns) / SECOND
 
-    def pace(self, stamp_ns):
-        """How fast the time of the path that is followed goes [-]."""
+    def pace(self, stamp_ns, offset=0.0):
+        """How fast the time of the path that is followed goes, `offset` [s] from a stamp [-]."""
         return 1.0
 
     def piece(self, stamp_ns):
@@ -425,6 +425,7 @@ class SlowedPath:
     def __init__(self, path, start_ns, duration_ns):
         self._way, self.start_ns, self.duration_ns = path, start_ns, duration_ns
         self.followed, self.scaled = path.followed, path.scaled
+        self.began_unscaled = path.began_unscaled
         self._slowing = Slowing(duration_ns / SECOND)
         self._begin_ns = max(start_ns - path.start_ns, 0)
         self.begin_state, self._end = np.zeros((2, *path.begin_state.shape))
@@ -442,9 +443,9 @@ class SlowedPath:
         whole = int(s * SECOND)
         return self._way.start_ns + self._begin_ns + whole, s - whole / SECOND
 
-    def _at(self, stamp_ns):
-        """The `_place` of a stamp."""
-        since = max(stamp_ns - self.start_ns, 0) / SECOND
+    def _at(self, stamp_ns, offset=0.0):
+        """The `_place` of a time `offset` [s] from a stamp."""
+        since = max(stamp_ns - self.start_ns, 0) / SECOND + offset
         return self._place(self._slowing.at(since)[0])
 
     def elapsed(self, stamp_ns):
@@ -456,9 +457,9 @@ class SlowedPath:
         """How fast the path's time goes, s', `offset` [s] from a stamp [-]."""
         return self._slowing.at((stamp_ns - self.start_ns) / SECOND + offset)[1]
 
-    def pace(self, stamp_ns):
-        """How fast the time of the path that is followed goes [-]."""
-        return self.speed(stamp_ns) * self._way.pace(self._at(stamp_ns)[0])
+    def pace(self, stamp_ns, offset=0.0):
+        """How fast the time of the path that is followed goes, `offset` [s] from a stamp [-]."""
+        return self.speed(stamp_ns, offset) * self._way.pace(*self._at(stamp_ns, offset))
 
     @property
     def pushes(self):
@@ -511,7 +512,7 @@ class FinishedPath:
         Stamp of the stop [ns].
     """
 
-    trajectory_id, scaled = 0, False
+    trajectory_id, scaled, began_unscaled = 0, False, True
 
     def __init__(self, path, start_ns):
         self.followed, self.start_ns = path, start_ns
@@ -526,10 +527,6 @@ class FinishedPath:
     def pushes(self):
         """Whether there is an effort on the way."""
         return self.followed.pushes
-
-    def speed(self, stamp_ns, offset=0.0):
-        """How fast the path's time goes [-]."""
-        return 1.0
 
 
 def at_rate(state, rate, change):

@@ -86,13 +86,15 @@ class ScaledPath:
     path : Path
         A path that has begun and is not changed any more.
     law : TimeLaw
+    began_unscaled : bool
+        Whether the path's time was the arm's from its start until the law began.
     """
 
     #: Whether the path's time differs from the arm's.
     scaled = True
 
-    def __init__(self, path, law):
-        self.followed, self.law = path, law
+    def __init__(self, path, law, began_unscaled=False):
+        self.followed, self.law, self.began_unscaled = path, law, began_unscaled
         self.trajectory_id, self.start_ns = path.trajectory_id, path.start_ns
         self.duration_ns, self.begin_state = path.duration_ns, path.begin_state
         self._own = np.zeros_like(path.begin_state)
@@ -114,9 +116,9 @@ class ScaledPath:
         """Time of the path at a stamp, from the path's start [s]."""
         return self.law.at(stamp_ns)[0]
 
-    def pace(self, stamp_ns):
-        """How fast the time of the path that is followed goes [-]."""
-        return self.law.at(stamp_ns)[1]
+    def pace(self, stamp_ns, offset=0.0):
+        """How fast the time of the path that is followed goes, `offset` [s] from a stamp [-]."""
+        return self.law.at(stamp_ns, offset)[1]
 
     def rate(self, stamp_ns):
         """Largest rate from a stamp on [-]."""
