@@ -27,7 +27,7 @@ CACHES := __pycache__ .pytest_cache .ruff_cache .hypothesis *.egg-info
 help:
 	@echo 'make build      set up .venv and build the workspace; again: only what changed'
 	@echo 'make demo       build, then run the case study'
-	@echo 'make test       build, then run all tests; e.g. PYTEST_ARGS="-k observer -x"'
+	@echo 'make test       build, then run the tests; LONG=all: the long ones, too; e.g. PYTEST_ARGS="-k observer -x"'
 	@echo 'make check      build, then style, imports and the quick unit tests: about a minute'
 	@echo 'make mutants    build, then put in errors one at a time: a test must fail for each; MUTANTS_ARGS="-k chain"'
 	@echo 'make wheel      build, then a wheel of what needs no ROS, for pip, in results/wheel'
@@ -59,20 +59,23 @@ demo: build
 # cores. pytest's 5 means that PYTEST_ARGS selects nothing there.
 # The long ones of nodes begin: short ones at the end keep both processes busy. Files without tests in real time need
 # not be imported again for these.
+# LONG says which of the tests marked long run: none, all, or one part of several, such as 2/6. Tests that are asked for by
+# PYTEST_ARGS run, long or not.
 TESTS := tests $(wildcard src/*/test)
+LONG ?= $(if $(PYTEST_ARGS),all,none)
 REAL_TIME = $(shell grep -l real_time $(foreach folder,$(TESTS),$(wildcard $(folder)/test_*.py)))
 # Two processes with several threads each hold each other up: small matrices then take several times as long.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 test: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; \
-	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not real_time" $(PYTEST_ARGS) $(TESTS); others=$$?; \
+	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not real_time" --long $(LONG) $(PYTEST_ARGS) $(TESTS); others=$$?; \
 	python -m pytest -q -m real_time $(PYTEST_ARGS) $(REAL_TIME); real_time=$$?; \
 	case $$others$$real_time in 00|05|50) ;; *) exit 1 ;; esac
 
 # The inner loop: style, imports, and the unit tests that are over quickly.
 check: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; ruff check && ruff format --check -q && \
-	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not slow and not real_time" $(PYTEST_ARGS) \
+	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not slow and not long and not real_time" $(PYTEST_ARGS) \
 	$(wildcard src/*/test) tests/test_architecture.py
 
 # After a change of a version in requirements/: the hashes that pip compares with what it downloads. Needs the network, and

@@ -27,6 +27,7 @@ def elbow_inertia(p):
     return p["Jh2"] + p["rhoA"] * p["L"] ** 3 / 3.0 + p["Mp"] * p["L"] ** 2 + p["Jp"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ARMS)
 def test_three_derivations_give_the_same_accelerations(case):
     p = cases.parameters(case)
@@ -67,6 +68,7 @@ def test_the_cases_of_the_benchmark_are_simulated_within_their_targets(case):
     assert off["tip"] > 2.0 * cases.TARGETS[case]  # stiffening matters
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ARMS)
 def test_the_cases_are_simulated_within_their_targets(case):
     columns = {}

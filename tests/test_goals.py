@@ -271,6 +271,7 @@ LIVES = {
 }
 
 
+@pytest.mark.long
 def test_random_goals_with_cancel_preemption_tolerances_and_kills_always_have_the_right_result(
     tmp_path,
 ):

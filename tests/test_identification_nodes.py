@@ -43,6 +43,7 @@ def arms(tmp_path):
     return truth, given
 
 
+@pytest.mark.long
 def test_an_arm_is_shaken_recorded_and_identified(bench, arms, tmp_path, capsys):
     truth, given = arms
     own = {"arm": str(truth), "rate": RATE, "lockstep": True, "resend_period": 0.02, "noise": True}

@@ -174,6 +174,7 @@ def test_motions_of_the_cases_are_those_of_their_arms():
         assert np.abs(np.subtract(case.end, case.begin)).max() > 0.5
 
 
+@pytest.mark.long
 def test_relay_and_loop_answer_in_real_processes():
     """As `flexarm latency` starts them, without its motion and its rounds; how fast is not asked."""
     case = replace(CASE, window=0.2)

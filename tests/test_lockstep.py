@@ -101,6 +101,7 @@ def loaded_cpu():
         busy.wait()
 
 
+@pytest.mark.long
 def test_five_runs_give_the_same_samples_bit_for_bit_with_and_without_one_cpu_loaded(tmp_path):
     runs = record(tmp_path / "0", 0.2, repeats=2)
     with loaded_cpu():

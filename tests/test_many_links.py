@@ -46,6 +46,7 @@ def test_the_simulator_runs_each_shipped_arm(name):
         assert np.abs(np.array(state.modal_amplitude) - sag).max() < 2e-2
 
 
+@pytest.mark.long
 def test_friction_that_makes_a_light_joint_hunt_in_the_simulator_is_reported(tmp_path, flexarm):
     tree = yaml.safe_load((ROOT / "config" / "arms" / "two_link.yaml").read_text())
     tree["joints"][1]["hub_inertia"] = 1e-5

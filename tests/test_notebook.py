@@ -11,6 +11,7 @@ import pytest
 NOTEBOOK = Path(__file__).resolve().parents[1] / "examples" / "arm_to_figure.ipynb"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_notebook_goes_from_an_arm_file_to_a_figure(tmp_path, monkeypatch):
     matplotlib.use("Agg")

@@ -28,6 +28,7 @@ def dumped(node):
     return yaml.dump({f"/{node.get_name()}": {"ros__parameters": tree}}, default_flow_style=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_dump_of_all_parameters_starts_the_node_again(tmp_path, name):
     with InProcess() as nodes:

@@ -122,6 +122,7 @@ def test_responses(columns, efficiency):
         assert abs(gains[gains[:, 0] < 10.0, 5]).max() <= 8.0 and abs(steps[:, 5]).max() <= 3.0
 
 
+@pytest.mark.long
 def test_the_designed_control_holds_it_on_a_plant_with_more_modes():
     found = design(arm_file.load("flexlink"), Settings(rate=500.0, delay=0.002))
     motion = {"trajectory": "quintic:to=0.785,duration=0.8", "rate": 500.0, "delay": 0.002}

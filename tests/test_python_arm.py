@@ -52,6 +52,7 @@ def test_a_running_loop_is_joined_and_goes_on_afterwards(tmp_path, monkeypatch):
         bench.check()
 
 
+@pytest.mark.long
 def test_the_example_moves_an_arm_and_draws_it(tmp_path):
     with own_domain() as domain:  # nothing runs there
         done = subprocess.run(

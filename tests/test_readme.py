@@ -232,6 +232,7 @@ def call(command):
     options.function(options)
 
 
+@pytest.mark.long
 def test_commands_of_the_two_link_arm_move_it(monkeypatch):
     commands = [c for c in starting("./flexarm", "run") if "two_link" in c]
     with in_lockstep(commands, monkeypatch) as arm:

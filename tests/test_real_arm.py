@@ -20,6 +20,8 @@ import pytest
 from flexarm_studies.identification import ring_damping, strain_fit
 from flexarm_tools.identification import strains
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "real_arm.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"^ *```sh\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)

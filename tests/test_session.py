@@ -95,6 +95,7 @@ def session(tmp_path_factory):
         client.client.destroy()
 
 
+@pytest.mark.long
 def test_sixty_calls_have_the_answers_that_they_should(session):
     """In the order of a session: what a part leaves behind, the next one begins with."""
     for part in (looked_at, refused, set_and_designed, called, sent, followed, streamed, failed):

@@ -17,6 +17,7 @@ from soak.invariants import Invariants
 from soak.walk import walk
 
 
+@pytest.mark.long
 def test_a_short_life_with_faults_breaks_no_invariant():
     # This seed's first round has three faults, a new gain, a refused one and a stop.
     options = command.parser().parse_args(["--rounds", "1", "--minutes", "60", "--seed", "103"])
@@ -27,6 +28,7 @@ def test_a_short_life_with_faults_breaks_no_invariant():
     assert life.invariants.counts["enabled"] > 1000
 
 
+@pytest.mark.long
 def test_a_random_walk_through_transitions_services_and_parameters_ends_in_a_motion():
     lines, good = walk(3, 200, lambda text: None)
     assert good, "\n".join(lines)

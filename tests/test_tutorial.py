@@ -21,6 +21,8 @@ from flexarm_bringup import cli
 from flexarm_tools.running.lockstep import LockstepRun
 from flexarm_tools.running.processes import Processes, executable, own_domain
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parents[1]
 LESSONS = ROOT / "docs" / "tutorial"
 BLOCK = re.compile(r"^```(\w+)( real-time)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -141,6 +141,7 @@ def test_view_starts_nodes_and_page_and_ends_them(bench):
     assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
 
 
+@pytest.mark.long
 def test_what_is_clicked_the_nodes_do_and_what_they_say_is_shown(bench, arm, screen):
     page = screen.page
 

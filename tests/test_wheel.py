@@ -95,6 +95,7 @@ def installed(tmp_path_factory):
     return folder, run
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_five_lines_of_python_make_a_figure(installed):
     folder, run = installed
@@ -114,6 +115,7 @@ def test_commands_work_without_ros_or_say_that_they_need_it(installed):
     assert "Traceback" not in error
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_bag_is_read_without_ros(installed, flexarm):
     folder, run = installed

@@ -255,6 +255,7 @@ def test_a_design_that_does_not_come_back_is_made_slower_until_one_does(monkeypa
     assert reported[-1] == 1.0 and max(reported[:-1]) >= 0.8
 
 
+@pytest.mark.long
 def test_where_none_comes_back_it_is_the_one_that_is_soonest(monkeypatch):
     late = {1.0: np.inf, SLOWER[0]: 6.0, SLOWER[1]: 5.0, SLOWER[2]: 7.0}
     asked = by_speed(monkeypatch, lambda speed: Recovery.of([(late[speed], 1.0)]))

@@ -7,14 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from numpy.polynomial import Polynomial
 from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control, flat
 from flexarm_control.composite.full_order import closed_loop
 from flexarm_control.low_pass import LowPass
+from flexarm_control.robust import card as card_module
 from flexarm_control.robust import design as design_module
 from flexarm_control.robust import trade as trade_module
-from flexarm_control.robust.card import card, poles
+from flexarm_control.robust.card import card, poles, torque_used
 from flexarm_control.robust.decay import Poles, Slowest, Wanted, eigenvalues
 from flexarm_control.robust.design import (
     CANCELLED,
@@ -46,7 +48,7 @@ from flexarm_control.robust.uncertain import (
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import DesignError, ModelError
-from flexarm_dynamics.linear import linear_plant, sampled
+from flexarm_dynamics.linear import linear_plant, sampled, static_torque
 from flexarm_dynamics.models.model import build
 
 QUICK = Settings(rate=500.0, delay=0.002, effort=0.5)
@@ -247,6 +249,7 @@ def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed
     assert fractions == sorted(fractions) and nearby == pytest.approx(fractions[-3])
 
 
+@pytest.mark.long
 def test_sets_of_gains_that_are_slow_go_on_from_gains_nearby_together(two_link, monkeypatch):
     at = ((0.0, 0.4), (0.0, 1.0))
     settings = Settings(rate=500.0, delay=0.002, effort=0.02, configurations=at)
@@ -493,6 +496,45 @@ def test_the_card_ends_where_the_loop_becomes_unstable(designed):
     # What it was made for is borne; how much more depends on where the search ends.
     assert bears.delay > 0.004 and bears.gain[0] < 0.6 and bears.gain[1] > 1.7
     assert bears.payload[1] > 1.3 and bears.stiffness[0] < 0.9
+
+
+def test_the_torque_used_is_that_of_a_motion_that_bends_the_links_as_if_it_were_slow(designed):
+    one, heavier = card(designed).torque_used
+    arm = richer(designed.arm)
+    period, (limit,) = 2.0 * np.pi / designed.omega_1, designed.arm.torque_limits
+    quintic, s, length = (
+        Polynomial([0, 0, 0, 10, -15, 6]),
+        np.linspace(0.0, 1.0, 2001),
+        2.0 * period,
+    )
+    acceleration, snap = (np.radians(75.0) * quintic.deriv(k)(s) / length**k for k in (2, 4))
+    for payload, found in ((1.0, one), (1.3, heavier)):
+        terms = build(scaled(arm, payload, 1.0)).terms(np.zeros(1), np.zeros(1))
+        bent = -np.linalg.solve(terms.K2, terms.M[1:, 0])  # by the acceleration
+        torque = terms.M[0, 0] * acceleration + terms.M[0, 1:] @ bent * snap
+        assert_allclose(found * limit, np.abs(torque).max(), rtol=0.01)
+    assert one < heavier
+
+
+def test_the_torque_used_includes_the_weight_and_is_unknown_where_the_arm_does_not_rest(
+    monkeypatch,
+):
+    arm, q = arm_file.load("one_link"), np.zeros((1, 1))
+    hung = replace(arm, gravity=(0.0, -0.5, 0.0))
+
+    def used(of, payload=1.0):
+        return torque_used(SimpleNamespace(arm=of, configurations=q), payload)
+
+    lifted = np.abs(static_torque(build(richer(hung)), q[0])) / arm.torque_limits
+    assert lifted > 0.005
+    assert_allclose(used(hung) - used(arm), lifted, rtol=0.01)
+
+    def folds(*_):
+        raise ModelError("it folds")
+
+    monkeypatch.setattr(card_module, "static_torque", folds)
+    assert np.isnan(used(hung, 2.0)).all()
+    assert torque_used(SimpleNamespace(arm=arm_file.load("rigid"), configurations=q), 1.0) == 0.0
 
 
 @pytest.fixture(scope="module")

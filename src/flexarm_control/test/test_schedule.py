@@ -138,6 +138,7 @@ def test_loops_that_limit_the_others_are_asked_less_once(scheduled):
     assert search.relaxed(None, near)[0] is None
 
 
+@pytest.mark.long
 def test_a_design_of_two_links_holds_at_every_place_that_it_names():
     settings = Settings(
         rate=500.0, delay=0.002, effort=0.1, configurations=((0.0, 0.4), (0.0, 0.9))

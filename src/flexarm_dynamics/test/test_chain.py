@@ -529,6 +529,7 @@ def close(ours, theirs, tolerance, what="", scale=None):
 arms = {"seed": seeds, "layout": layouts(), "level": st.sampled_from(LEVELS)}
 
 
+@pytest.mark.long
 @examples
 @given(**arms)
 @pytest.mark.slow
@@ -698,6 +699,7 @@ def test_angular_momentum_about_the_first_joint_changes_by_its_torque_alone(leve
 # --- kinematics --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @examples
 @given(**arms, link=st.integers(0, 4), where=st.floats(0.0, 1.0))
 def test_points_turn_and_move_as_in_the_second_derivation(seed, layout, level, link, where):

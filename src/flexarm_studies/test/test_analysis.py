@@ -147,6 +147,7 @@ def margin(case, name):
     return kind, value
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["delay", "gain_high", "payload_high", "rate_low"])
 def test_margins_are_where_runs_become_unstable(paper, name, monkeypatch):
     monkeypatch.setattr(trial, "WATCHED", 1.5)
@@ -244,6 +245,7 @@ def test_the_default_motion_of_long_reach_is_one_that_it_can_do():
     assert found.word == "stable, fragile" and "to a delay 2 ms longer" in found.text
 
 
+@pytest.mark.long
 def test_an_arm_in_space_that_can_only_hang_is_analysed_there(changed_arm):
     def weak(data):
         for joint, torque in zip(data["joints"], (60.0, 220.0, 120.0, 20.0), strict=True):
@@ -262,6 +264,7 @@ def test_an_arm_in_space_that_can_only_hang_is_analysed_there(changed_arm):
     assert found.word != "unknown"
 
 
+@pytest.mark.long
 def test_the_verdict_is_that_of_runs():
     values = parameters("two_link")
     sure = judged("two_link", values, "paper")

@@ -43,6 +43,7 @@ def test_samples_differ_are_in_their_ranges_and_are_their_number_s_own(spec):
     assert mc.draw(replace(spec, seed=8), 3) != drawn[3]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_one_and_two_workers_and_threads_give_the_same(spec, results):
     assert mc.run(spec, COUNT, workers=2) == results
@@ -151,6 +152,7 @@ def test_without_dask_the_error_tells_what_to_install(spec, monkeypatch):
         mc.run(spec, 1, scheduler="tcp://127.0.0.1:1")
 
 
+@pytest.mark.long
 def test_two_dask_worker_processes_give_the_same(spec, results):
     distributed = pytest.importorskip("distributed")
     own = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}

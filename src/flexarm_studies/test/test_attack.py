@@ -447,6 +447,7 @@ def test_the_table_has_the_worst_of_all_runs_and_the_worst_lie_on_top(tmp_path):
     assert "| a |" in page.read_text() and page.read_text().endswith("after")
 
 
+@pytest.mark.long
 def test_bent_links_hardly_turn_a_heavy_joint_and_no_torque_that_may_return_holds_a_light_one(
     honest,
 ):
@@ -465,6 +466,7 @@ def test_a_table_of_recoil_has_each_joint_once(tmp_path, capsys):
     assert len(rows) == 1 and rows[0] in page.read_text()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_command_runs_in_processes_and_its_exit_code_reports(tmp_path, capsys):
     out = tmp_path / "rows.json"

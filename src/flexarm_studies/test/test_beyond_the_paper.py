@@ -59,6 +59,7 @@ def test_with_a_payload_a_third_off(scale, feedforward):
     assert found["residual_tip_rms_mm"] / 304.8 <= 5e-5
 
 
+@pytest.mark.long
 def test_with_an_encoder_and_an_observer():
     """4096 counts, joint velocities from them, modal rates from the gauges."""
     arm = arm_file.load("R")
@@ -132,6 +133,7 @@ def test_a_gap_in_the_samples_does_not_shake_the_simulated_arm():
     assert np.degrees(errors[-1]) < 1e-2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("payload", [0.0, 3.0])
 def test_an_unknown_payload_is_learnt_by_the_second_time(payload):
     """Peak joint error below 0.5 deg the second time, of 0.8 to 1.9 deg the first."""

@@ -54,6 +54,11 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
     assert re.search(
         r"^  torque limits +payload x 1\.3: settled after 1\.\d locked periods", printed, re.M
     )
+    assert re.search(
+        r"^  torque used +9\d % of the limit of joint1 at most \(payload x 1\.3: 9\d %\)",
+        printed,
+        re.M,
+    )
     assert "\n  speed " not in printed and "warning" not in printed
     nodes = parameter_files.load(out)
     controller, observer = nodes["controller"], nodes["observer"]
@@ -105,6 +110,8 @@ def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
     assert found["tip_stiffness_N_m"] > found["tip_stiffness_without_integral_N_m"] > 0.0
     assert 0.0 < found["phase_rad"] < 3.2 and found["settling_s"] > 0.0
     assert found["speed"] == 1.0 and found["recovery"]["comes_back"]
+    (used,), (heavier,) = found["torque_used"]
+    assert 0.9 < used < heavier < 1.0
     assert found["recovery"]["limited"] >= found["recovery"]["unlimited"] > 0.0
     assert found["payload"][1] is None or found["payload"][1] > 1.3
     assert "<svg" in path.read_text()
@@ -121,6 +128,7 @@ def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
     assert any(f"{np.degrees(found['phase_rad']):.2g} deg" in t.get_text() for t in noise.texts)
 
 
+@pytest.mark.long
 def test_speed_against_robustness_as_a_table_a_drawing_and_json(tmp_path, capsys):
     path = tmp_path / "trade.png"
     words = ["design", "R", *LOOP, "--effort", "0.1", "--speeds", "0.3,0.1", "--figure", str(path)]
@@ -206,6 +214,7 @@ def test_an_arm_that_is_not_shipped_moves_without_any_parameter(tmp_path, capsys
     assert outputs[2]["final_tip_error_mm"] > 2.0 * outputs[0]["final_tip_error_mm"]
 
 
+@pytest.mark.long
 def test_a_delay_that_the_design_does_not_bear_is_reported(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cache, "cache_directory", lambda: tmp_path)
     words = [
@@ -220,6 +229,7 @@ def test_a_delay_that_the_design_does_not_bear_is_reported(tmp_path, capsys, mon
     assert "longer than the" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "motion", "residual"),
     [

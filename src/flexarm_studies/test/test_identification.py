@@ -38,6 +38,7 @@ def shaken(given):
     return truth, measured, identify(given, measured)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_intervals_cover_the_truth_and_are_narrow_but_not_too_wide():
     table = coverage.run(ARMS, seed=1, rate=RATE, settings=SHORT)

@@ -132,6 +132,7 @@ def _gain(factor):
     return lambda strain: strain * np.array([factor, 1.0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("payload", [1.0, 1.3])
 @pytest.mark.parametrize(
     "factor", [0.0, -1.0, 0.8, 1.2], ids=["dead", "wrong sign", "-20 %", "+20 %"]

@@ -38,6 +38,7 @@ def drawn():
 # --------------------------------------------------------------------------- designs
 
 
+@pytest.mark.long
 def test_an_arm_with_light_hubs_has_gains_by_a_low_pass():
     # Without it, modes beyond the loop's reach leave the joints next to no stiffness.
     case = generator.arm(5)
@@ -318,6 +319,7 @@ def test_the_plant_is_more_than_the_model_and_its_sensors_ideal_unless_noisy():
     assert noisy.gauges == arm.gauges and noisy.joints == arm.joints
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("implicit", "losses", "steps", "lost"),
     [(True, 1, [1, 3], False), (True, 2, [1, 3], True), (False, 1, [1], True)],
@@ -343,6 +345,7 @@ def test_a_run_that_is_lost_is_lost_in_shorter_steps_too(
     assert [n / counts[0] for n in counts] == steps
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_baseline_that_is_tuned_for_the_arm_settles_on_it_and_the_same_every_time():
     case = arm_like_r()
@@ -353,6 +356,7 @@ def test_a_baseline_that_is_tuned_for_the_arm_settles_on_it_and_the_same_every_t
     assert again == found
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_designed_controller_runs():
     case = arm_like_r()
@@ -499,6 +503,7 @@ def test_a_share_of_less_than_all_is_not_100_percent():
     assert report._share([True] * 600) == "600 of 600 (100 %)"
 
 
+@pytest.mark.long
 def test_what_noise_alone_makes_is_measured_beside_a_noisy_run():
     case = arm_like_r()
     setup = CONTROLLERS["pid"](case)

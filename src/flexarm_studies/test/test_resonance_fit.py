@@ -52,6 +52,7 @@ def check(made, modes=MODES):
     return np.abs(off)
 
 
+@pytest.mark.long
 def test_three_modes_under_a_tenth_of_noise_are_found_with_intervals_that_hold():
     off = [check(fits.fit(ringing(np.random.default_rng(s)), 1.0 / RATE)) for s in range(8)]
     assert np.mean(np.array(off) < 1.0) > 0.85  # of 48; 95 % are meant
@@ -71,6 +72,7 @@ def test_coloured_noise_widens_the_intervals_where_it_is_loud():
     assert ratio[0] > 1.5 and ratio[0] > 1.5 * ratio[1]
 
 
+@pytest.mark.long
 def test_a_sweep_gives_the_same_modes():
     for seed in range(2):
         values, base = swept(np.random.default_rng(seed))

@@ -29,6 +29,7 @@ def modes_of(name):
     return [(abs(p) / (2.0 * np.pi), -p.real / abs(p)) for p in poles]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [STEP, SWEEP])
 def test_a_simulated_arm_rings_as_its_closed_loop_does(kind, tmp_path, result):
     (first, damping), (second, _) = modes_of("one_link")[:2]

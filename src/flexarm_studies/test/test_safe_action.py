@@ -118,6 +118,7 @@ def measured():
     return {}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "row", [pytest.param(r, marks=pytest.mark.slow) if "long" in r else r for r in ACTIONS]
 )

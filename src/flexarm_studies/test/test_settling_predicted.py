@@ -15,6 +15,7 @@ from flexarm_studies.uncertain.baselines import RATE, task_of
 from flexarm_studies.uncertain.plants import DELAY, VARIANTS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [9, 33])
 def test_the_tip_settles_when_the_design_predicts(number):
     """One link with finite slopes, a mode more and friction, a slow arm and a quick one; within half a locked period.

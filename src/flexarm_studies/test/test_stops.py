@@ -18,7 +18,7 @@ from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_studies.loop import scenario
 from flexarm_studies.loop.scenario import Scenario, parameters
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "safety.md"
 MARKS = "<!-- stops: begin -->", "<!-- stops: end -->"

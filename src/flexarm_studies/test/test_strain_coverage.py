@@ -7,6 +7,8 @@ import pytest
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_studies.identification import strain_coverage, strain_fit
 
+pytestmark = pytest.mark.long
+
 
 def test_what_is_drawn_is_noisy_as_it_says():
     run, truth = strain_coverage.drawn([3, 1])

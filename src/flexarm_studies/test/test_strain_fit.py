@@ -19,6 +19,8 @@ from flexarm_studies.identification.strain_fit import (
 )
 from flexarm_studies.identification.strain_quantities import Setup, changed, value_of
 
+pytestmark = pytest.mark.long
+
 ARM = """
 name: geared
 gravity: [0.0, -9.81, 0.0]

@@ -55,6 +55,7 @@ def geared(data, encoder, play=0.012, stiffness=850.0, weight=9.81):
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("encoder", ["motor", "link"])
 def test_a_controller_that_knows_rigid_joints_holds_an_arm_with_play(changed_arm, encoder):
     path = changed_arm("one_link", partial(geared, encoder=encoder))
@@ -73,6 +74,7 @@ def test_a_controller_that_knows_rigid_joints_holds_an_arm_with_play(changed_arm
         assert metrics["final_tip_error_mm"] < 0.5
 
 
+@pytest.mark.long
 def test_a_design_is_for_loops_with_the_transmission_in_them(changed_arm):
     arm = arm_file.load(changed_arm("one_link", partial(geared, encoder="motor", play=0.0)))
     short = design(arm, Settings(rate=500.0, delay=0.002, effort=1e-3))

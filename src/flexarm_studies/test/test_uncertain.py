@@ -279,6 +279,7 @@ def test_what_is_kept_is_there_again(tmp_path):
         Store(path, command.Specification(1, []))
 
 
+@pytest.mark.long
 def test_compare_judges_on_uncertain_plants_and_goes_on(tmp_path, monkeypatch, capsys):
     short = replace(R, motion="quintic:to=0.1,duration=0.5")
     monkeypatch.setattr(cases, "CASES", (short,))

@@ -92,6 +92,7 @@ def test_the_quickest_motions_on_a_line_are_the_trapezoid_and_one_with_less_jerk
     assert 3.0 < smooth.duration < 6.0
 
 
+@pytest.mark.long
 def test_a_motion_along_which_the_frequency_rises_needs_the_modes_of_both_ends_and_is_best_retimed():
     case = cases.random_arm(2)
     arm = PositionArm(model.build(case.known), model.build(case.plant), 2.0 * np.pi / case.period)
@@ -110,6 +111,7 @@ def test_a_motion_along_which_the_frequency_rises_needs_the_modes_of_both_ends_a
     assert max(new) < 0.06 * unshaped
 
 
+@pytest.mark.long
 def test_a_path_that_bends_is_shaped_by_the_modes_of_both_ends():
     case = cases.random_arm(2)
     motion = case.motions[0]
@@ -154,6 +156,7 @@ def test_the_table_counts_what_is_within_what_is_wanted():
     assert line.startswith("| x, motion 1 | retimed | 0.1 | 0.3 | 0.1 | 0.05 |")
 
 
+@pytest.mark.long
 def test_the_least_that_a_time_law_leaves_is_far_below_what_modes_tell():
     case = cases.all_of(0)["payload x1"]()
     unshaped, left, least = study.at_least(case, 1)
@@ -175,17 +178,20 @@ def test_in_more_time_less_is_left():
     assert three < 0.02 < one
 
 
+@pytest.mark.long
 def test_by_modes_at_more_places_less_is_left_where_they_come_close():
     few, many = study.at_more_places(cases.random_arm(7), 2, (3, 5))
     assert many < 0.08 < 0.1 < few
 
 
+@pytest.mark.long
 def test_corrections_in_trials_take_out_what_the_measured_modes_have_missed():
     case = cases.random_arm(7)  # two modes of it come close half-way
     before, *_, after = study.in_trials(case, 0, 3)
     assert after < 0.06 < 0.1 < before  # 0.049 or 0.051, as the processor rounds
 
 
+@pytest.mark.long
 def test_a_push_decays_five_times_faster_with_damping_by_strain():
     found = pushes.decay(1.0)
     assert found.frequency == pytest.approx(3.78, rel=0.02)

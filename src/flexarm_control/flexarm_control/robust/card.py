@@ -8,10 +8,12 @@ from scipy.linalg import eigvals
 
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import ModelError
+from flexarm_dynamics.linear import static_torque
 from flexarm_dynamics.models.model import build
 
 from .decay import eigenvalues
 from .loop import measured_amplitudes, sampled_loop
+from .settling import Motion
 from .tip import Tip, softest
 from .uncertain import richer
 
@@ -19,6 +21,8 @@ from .uncertain import richer
 BISECTIONS, FARTHEST, LATEST = 12, 16.0, 40.0
 #: A pole with the decay d has 2 % left after this over d.
 LEFT = 4.0
+#: Steps per locked period of a motion whose largest torque is looked for.
+PEAK_STEPS = 200
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,10 @@ class Card:
         in the slowest configuration [s].
     slowest : float
         After this time the slowest pole of the uncertain loops has 2 % left [s].
+    torque_used : ndarray, shape (2, n)
+        Largest torque of each joint over its limit, the weight included, in a motion of any one joint of
+        `settling.ANGLE` in `settling.MOTION` locked periods: with the payload of the file, and with the heaviest; zero
+        where there is no limit, NaN where the arm does not rest [-].
     tip_stiffness, tip_stiffness_proportional : float
         Of the tip against a static force, in the softest direction and configuration: when the integral has brought
         the joints back, so that the links alone bend, and without the integral [N/m].
@@ -53,6 +61,7 @@ class Card:
     damping: float
     settling: float
     slowest: float
+    torque_used: np.ndarray
     tip_stiffness: float
     tip_stiffness_proportional: float
 
@@ -118,9 +127,26 @@ def card(design):
         damping,
         settling,
         LEFT / slowest if slowest > 0.0 else np.inf,
+        np.array([torque_used(design, factor) for factor in (1.0, design.uncertainty.payload[1])]),
         min(softest(tip.compliance())[0] for tip in tips),
         min(softest(tip.compliance(held))[0] for tip, held in zip(tips, given, strict=True)),
     )
+
+
+def torque_used(design, payload):
+    """One row of `Card.torque_used`, (n,), with a factor of the payload [-]."""
+    nominal, plant = build(design.arm.known), build(scaled(richer(design.arm.whole), payload, 1.0))
+    limit, largest = np.array(nominal.arm.torque_limits), np.zeros(nominal.n_joints)
+    if not nominal.n_modes:
+        return largest
+    for q in design.configurations:
+        period = 2.0 * np.pi / nominal.frequencies(q, locked=True)[0]
+        try:
+            moving = Motion(plant, q, period, period / PEAK_STEPS).torque + static_torque(plant, q)
+        except ModelError:
+            return np.full_like(largest, np.nan)
+        np.maximum(largest, np.abs(moving).max(axis=(0, 1)), out=largest)
+    return largest / limit
 
 
 def poles(design):

@@ -207,6 +207,7 @@ def _result(found, bears):
         "phase_rad": bears.phase,
         "settling_s": bears.settling,
         "slowest_settling_s": bears.slowest,
+        "torque_used": bears.torque_used.tolist(),
         "tip_stiffness_N_m": bears.tip_stiffness,
         "tip_stiffness_without_integral_N_m": bears.tip_stiffness_proportional,
     }
@@ -305,6 +306,7 @@ def card_lines(found, bears):
         f"  bears delay         {_number(1e3 * bears.delay)} ms",
         f"  phase margin        {np.degrees(bears.phase):.2g} deg",
         f"  noise in the torque {', '.join(f'{100.0 * share:.2g} %' for share in found.noise)} of the limit, rms",
+        f"  torque used         {_used(found, bears)}",
         f"  torque limits       {_recovery(found)}",
     ]
     if found.left:
@@ -313,6 +315,24 @@ def card_lines(found, bears):
             f"  left to themselves  {listed}: no torque reaches these modes, or no gauge sees them"
         )
     return lines
+
+
+def _used(found, bears):
+    """The torque of a motion, in words."""
+    from flexarm_control.robust.settling import ANGLE, MOTION
+
+    seconds = MOTION * 2.0 * np.pi / found.omega_1
+    parts = []
+    for share, payload in zip(bears.torque_used, ("", "payload x "), strict=True):
+        k = int(np.argmax(share))  # that of a NaN, too
+        payload += f"{found.uncertainty.payload[1]:g}: " if payload else ""
+        known = np.isfinite(share[k])
+        parts.append(payload + (f"{100.0 * share[k]:.2g} %" if known else "the arm does not rest"))
+    name = found.arm.joints[int(np.argmax(bears.torque_used[0]))].name
+    return (
+        f"{parts[0]} of the limit of {name} at most ({parts[1]}), when one joint turns by {np.degrees(ANGLE):.0f} deg"
+        f" in two locked periods ({seconds:.3g} s)"
+    )
 
 
 def _recovery(found):
