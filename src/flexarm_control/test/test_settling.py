@@ -296,3 +296,57 @@ def test_gains_that_would_be_slower_than_asked_are_not_taken(r, monkeypatch):
         search.sooner(x, lambda y: (1.0 + 0.01 * pulls(y)[0], 0.01 * pulls(y)[1]), 1e-3, 60, 0.0)
         is x
     )
+
+
+def test_only_poles_near_the_lowest_frequency_ring_and_the_slowest_counts():
+    h, omega = 0.01, 2.0 * np.pi / 0.5
+    poles = [-0.05 + 1.0j, -0.2 + 3.0j, -0.01 + 7.0j, -0.02 + 0.4j, -0.03, -0.04]  # over omega
+    F = np.zeros((10, 10))
+    for k, s in enumerate(poles):
+        z = np.exp(s * omega * h)
+        at = 2 * k if k < 5 else 9
+        if np.imag(s):
+            F[at : at + 2, at : at + 2] = [[z.real, z.imag], [-z.imag, z.real]]
+        else:
+            F[at, at] = z.real
+    loop = SimpleNamespace(F=F, G=np.zeros((10, 1)), N=np.zeros((2, 10)), period=h)
+    one = Residual(loop, np.zeros((3, 2, 1)), np.zeros((4, 2)), np.zeros((3, 2)), 0.5, 0)
+    assert_allclose(one.ringing(np.zeros((1, 2))), 0.05, rtol=1e-9)
+    loop.F = np.diag(np.diag(F)[8:])
+    loop.G, loop.N = np.zeros((2, 1)), np.zeros((2, 2))
+    assert one.ringing(np.zeros((1, 2))) == np.inf
+
+
+def test_only_arms_whose_joints_rub_are_looked_at_for_what_rings(rough, r):
+    left = residuals(rough.task.nominal, np.zeros(1), rough.found.sampling, UNCERTAIN)
+    assert [one.rubs for one in left] == 3 * [False, True, True]
+    after = AfterMotion(rough.search.slowest, [(0, one) for one in left])
+    K = rough.search.slowest.gains(rough.x)[0]
+    rubbing = [one.ringing(K) for one in left if one.rubs]
+    assert after.ringing(rough.x) == min(rubbing) < np.inf
+    smooth = residuals(r.model, np.zeros(1), r.sampling, UNCERTAIN)
+    after = AfterMotion(rough.search.slowest, [(0, one) for one in smooth])
+    assert after.ringing(rough.x) == np.inf
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "taken"),
+    [
+        (0.038, 0.025, False),  # arm 7
+        (0.038, 0.035, True),  # hardly less
+        (0.2, 0.041, True),  # it does not ring for long
+        (0.2, 0.039, False),
+        (np.inf, np.inf, True),  # no friction
+    ],
+)
+def test_gains_that_let_a_mode_of_rubbing_joints_ring_longer_are_not_taken(
+    rough, monkeypatch, before, now, taken
+):
+    x = rough.search.slowest.scaled(rough.found.K)
+    monkeypatch.setattr(design_module, "MUCH", 1e-3)
+    monkeypatch.setattr(search_module.Search, "sooner", lambda self, x, *_: 1.01 * x)
+    monkeypatch.setattr(
+        AfterMotion, "ringing", lambda self, y: before if np.array_equal(x, y) else now
+    )
+    other = rough.task.sooner(lambda fraction, decay: None, rough.found)
+    assert (other is not rough.found) == taken

@@ -74,6 +74,9 @@ MUCH, LESS, SOONER, PLACES = 3.5, 0.6, 800, 3
 #: The slowest pole of all loops then keeps this part of the decay that was reached. Of loops that are there for a
 #: margin, this part of what was asked is asked [-].
 KEEP, EASED = 0.8, 0.5
+#: It takes no gains with which a mode would ring longer where the joints rub: with less than this part of the decay
+#: before, and less than this over omega_1. Linear loops then leave less, simulated arms leave more.
+SHORTER, RINGS = 0.9, 0.04
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
@@ -662,7 +665,7 @@ class _Task:
             LESS * most,
             lambda fraction: progress(fraction, found.decay),
         )
-        if other is x:
+        if other is x or after.ringing(other) < min(SHORTER * after.ringing(x), RINGS):
             return found
         used = found.evaluations + whole.evaluations + search.evaluations
         return self._sets(whole, other, used)

@@ -35,6 +35,7 @@ from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build
 
 from ..kernels import compiled
+from .decay import eigenvalues
 from .loop import sampled_loop
 from .tip import Tip
 from .uncertain import richer
@@ -51,6 +52,8 @@ LATE = 2
 #: An arm with Coulomb friction is also looked at with these parts of the damper that its friction is at rest. What is
 #: left then counts less: the motion is larger than those that meet so much of it.
 RUBBING, RUBS = (0.1, 0.3), 0.7
+#: Poles that turn faster than the first and slower than the second of these times the lowest locked frequency ring.
+RING = 0.5, 6.0
 #: Of the sum over all arms and configurations: the worst counts most.
 POWER = 8.0
 
@@ -75,10 +78,16 @@ class Residual:
         `LONGER`, if a period has at least `STEPS` steps.
     share : float
         Factor of J.
+
+    Attributes
+    ----------
+    rubs : bool
+        Whether friction damps its joints.
     """
 
     def __init__(self, loop, forces, push, tip, period, doublings, share=1.0):
         self.loop, self._doublings, self._share = loop, doublings, share
+        self.rubs, self._omega = share < 1.0, 2.0 * np.pi / period
         self._forces = np.ascontiguousarray(forces.transpose(0, 2, 1))  # as rows, as the states
         self._S = np.zeros((len(loop.F), push.shape[1]))
         self._S[: len(push)] = push
@@ -117,6 +126,12 @@ class Residual:
         if not outside.size:
             return 0.0
         return np.inf if outside[-1] == self._after else float(self._time[outside[-1] + 1])
+
+    def ringing(self, K):
+        """Decay of the slowest pole that rings, over the lowest locked frequency; infinite: none does [-]."""
+        s = np.log(eigenvalues(self.loop, K)[1].astype(complex)) / self.loop.period / self._omega
+        low, high = RING
+        return -s.real[(s.imag > low) & (s.imag < high)].max(initial=-np.inf)
 
     def __call__(self, K):
         """J, and its gradient by K; infinite where the tip leaves the range of numbers."""
@@ -181,6 +196,11 @@ class AfterMotion:
                 slope[k] += (one / value) ** (POWER - 1.0) * by_gains
         scale, free = self._slowest.scale, self._slowest.free
         return float(value), np.concatenate([(one * scale)[free] for one in slope])
+
+    def ringing(self, x):
+        """Least `Residual.ringing` of the arms whose joints rub; infinite: there are none [-]."""
+        K = self._slowest.gains(x)
+        return min((one.ringing(K[k]) for k, one in self._residuals if one.rubs), default=np.inf)
 
     def settling(self, x):
         """Longest settling time of all, in locked periods."""
