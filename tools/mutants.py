@@ -503,6 +503,18 @@ LAWS = [
         ),
         (
             "design",
+            "after a motion: gains are taken however long rubbing joints let a mode ring",
+            "other is x or after.ringing(other) <",
+            "other is x or np.inf <",
+        ),
+        (
+            "settling",
+            "after a motion: joints that do not rub count as what rings",
+            "for k, one in self._residuals if one.rubs)",
+            "for k, one in self._residuals)",
+        ),
+        (
+            "design",
             "after a motion: every design goes on",
             "min(decays) <= 0.0 or after(x)[0] < most",
             "min(decays) <= 0.0",

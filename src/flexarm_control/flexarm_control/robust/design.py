@@ -76,7 +76,7 @@ MUCH, LESS, SOONER, PLACES = 3.5, 0.6, 800, 3
 KEEP, EASED = 0.8, 0.5
 #: It takes no gains with which a mode would ring longer where the joints rub: with less than this part of the decay
 #: before, and less than this over omega_1. Linear loops then leave less, simulated arms leave more.
-SHORTER, RINGS = 0.9, 0.04
+SHORTER, RINGS = 0.9, 0.03
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
