@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 
 from flexarm_control.motions import profiles
+from flexarm_control.nodes.controller_report import Report
 from flexarm_control.robust import cache, default
 from flexarm_dynamics.arm import arm_file
 from flexarm_ros.node import WARN
@@ -124,6 +125,7 @@ def test_the_delay_of_the_loop_is_measured_and_compared_with_what_the_design_bea
         message = lockstep.trajectory_message(names, profile, 51, TRAJECTORY_START_NS)
         nodes.record(message, 0.2)
         level, text, values = nodes.nodes["controller"].diagnose()
+    assert values["speed of the design"] == "1"
     assert float(values["torque delay p50 [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)
     assert float(values["torque delay max [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)
     assert values["designed for a delay of [ms]"] == "3.000"
@@ -213,3 +215,29 @@ def test_a_node_that_designs_serves_and_ends(bench, tmp_path):
     bench.wait_for("the log", lambda: "so far: no torque meanwhile" in bench.log("controller"))
     assert bench.lifecycle("controller") == "configuring"
     assert bench.stop("controller", signal.SIGINT) == 0
+
+
+@pytest.mark.parametrize(
+    ("speed", "slowed", "comes_back", "shown"),
+    [
+        (0.7, False, True, "0.7"),
+        (0.35, True, True, "0.35, lowered because of the torque limits"),
+        (
+            0.35,
+            True,
+            False,
+            "0.35, lowered because of the torque limits; at the torque limits the arm may swing: give motions more"
+            " time",
+        ),
+    ],
+)
+def test_a_design_that_torque_limits_slow_is_shown_as_such(speed, slowed, comes_back, shown):
+    found = default.Default({}, 0.003, 0.01, 0.4, speed, slowed, comes_back)
+    with InProcess() as nodes:
+        nodes.start("controller", {"arm": "R"})
+        plain = nodes.nodes["controller"].diagnose()[2]
+        parts = nodes.nodes["controller"], nodes.nodes["controller"].core, found
+        values = Report(*parts).diagnose()[2]
+        del parts
+    assert "speed of the design" not in plain
+    assert values["speed of the design"] == shown

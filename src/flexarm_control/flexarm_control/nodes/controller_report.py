@@ -93,11 +93,18 @@ class Report:
         return *self._level(saturated, rate, median), values
 
     def _of_design(self):
-        if self._design is None:
+        design = self._design
+        if design is None:
             return {}
+        speed = f"{design.speed:g}"
+        if design.slowed:
+            speed += ", lowered because of the torque limits"
+        if not design.comes_back:
+            speed += "; at the torque limits the arm may swing: give motions more time"
         return {
-            "designed for a delay of [ms]": _milliseconds(self._design.delay),
-            "bears a delay of [ms]": _milliseconds(self._design.bears_delay),
+            "designed for a delay of [ms]": _milliseconds(design.delay),
+            "bears a delay of [ms]": _milliseconds(design.bears_delay),
+            "speed of the design": speed,
         }
 
     def _of_payload(self):

@@ -84,6 +84,9 @@ class Default(NamedTuple):
     delay: float  # it is made for [s]
     bears_delay: float  # longest one with which it is stable [s]
     reached: float  # `Design.reached` [-]
+    speed: float  # of the design [-]
+    slowed: bool  # `Design.slowed`
+    comes_back: bool  # `Design.comes_back`
 
 
 def is_wanted(name, given, kind=AUTO):
@@ -148,6 +151,9 @@ def find(arm, settings, uncertainty):
         "parameters": found.parameters(),
         "bears_delay": float(card(found).delay),
         "reached": float(found.reached),
+        "speed": float(found.settings.speed),
+        "slowed": bool(found.slowed),
+        "comes_back": bool(found.comes_back),
     }
 
 
@@ -166,7 +172,7 @@ def default(arm, settings, uncertainty, make=find):
         cache.write(name, entry)
     if "refused" in entry:
         raise DesignError(field=f"controller of {arm.name}", **entry["refused"])
-    return Default(entry["parameters"], settings.delay, entry["bears_delay"], entry["reached"])
+    return Default(delay=settings.delay, **entry)
 
 
 def is_cached(arm, settings, uncertainty):
