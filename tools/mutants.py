@@ -794,6 +794,18 @@ LAWS = [
         ),
         (
             "preview",
+            "a speed that is scaled on the way: the plan is dropped",
+            "or not path.began_unscaled:",
+            "or path.scaled:",
+        ),
+        (
+            "preview",
+            "a speed that is scaled on the way: the plan's bending does not fade",
+            "left = path.pace(stamp_ns, offset)",
+            "left = 3.0",
+        ),
+        (
+            "preview",
             "torque of the coming period",
             "plan.torque_at(elapsed + 0.5 * self.settings.period)",
             "0.9 * plan.torque_at(elapsed)",
