@@ -332,6 +332,7 @@ def test_without_a_controller_a_goal_is_aborted(tmp_path):
         client.client.destroy()
 
 
+@pytest.mark.long
 def test_where_control_msgs_is_installed_its_action_is_served_too(tmp_path, monkeypatch):
     """A stand-in of that name, with our own action: the wheels have no control_msgs."""
     package = tmp_path / "control_msgs" / "action"

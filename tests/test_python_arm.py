@@ -39,6 +39,7 @@ def test_an_arm_is_started_moved_recorded_and_stopped():
         assert arm.state.supervisor in ("READY", "HOLDING") and not arm.recover()
 
 
+@pytest.mark.long
 def test_a_running_loop_is_joined_and_goes_on_afterwards(tmp_path, monkeypatch):
     with Bench(tmp_path) as bench:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(bench.domain))

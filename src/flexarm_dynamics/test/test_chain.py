@@ -529,7 +529,6 @@ def close(ours, theirs, tolerance, what="", scale=None):
 arms = {"seed": seeds, "layout": layouts(), "level": st.sampled_from(LEVELS)}
 
 
-@pytest.mark.long
 @examples
 @given(**arms)
 @pytest.mark.slow

@@ -237,6 +237,7 @@ def judged(arm, values, motion, **changes):
     return verdict_of(loop_of(case.scenario), case.places, case.scenario.delay)
 
 
+@pytest.mark.long
 def test_the_default_motion_of_long_reach_is_one_that_it_can_do():
     values = parameters("long_reach")
     motion = default_motion(model.build(arm_file.load("long_reach")), values["fast.configuration"])

@@ -14,6 +14,8 @@ from flexarm_bringup import cli
 from flexarm_dynamics.arm import arm_file
 from flexarm_studies.identification import strain_fit
 
+pytestmark = pytest.mark.long
+
 ARM = """
 name: geared
 gravity: [0.0, -9.81, 0.0]
@@ -117,7 +119,6 @@ def whole(folder):
     return SimpleNamespace(result=json.loads(printed.getvalue()), out=out, plot=plot, page=page)
 
 
-@pytest.mark.long
 def test_a_part_is_fitted_and_another_scored_and_the_arm_file_names_origins(whole):
     result = whole.result
     for row in result["parts"]["score"].values():
@@ -162,7 +163,6 @@ def test_the_page_has_all_parts_every_number_and_nothing_from_the_network(whole)
     assert "http://" not in text and "https://" not in text
 
 
-@pytest.mark.long
 def test_without_parts_all_is_fitted_and_printed_for_people(identify, few_steps):
     code, printed, err = identify(*HOLD)
     assert code == 0, err
@@ -173,7 +173,6 @@ def test_without_parts_all_is_fitted_and_printed_for_people(identify, few_steps)
     assert "start 1 of 1" in err and "pass 1 of" in err
 
 
-@pytest.mark.long
 def test_a_state_file_of_another_fit_is_refused_and_of_the_same_goes_on(
     identify, folder, few_steps
 ):
@@ -208,7 +207,6 @@ def test_options_out_of_range_are_refused(identify, words, message, few_steps):
     assert code != 0 and message in err
 
 
-@pytest.mark.long
 def test_another_file_is_scored_with_its_own_bias(flexarm, folder, whole, few_steps):
     rows = np.genfromtxt(folder / "run.csv", delimiter=",", skip_header=1)
     rows[:, 2:] += 40.0
@@ -226,7 +224,6 @@ def test_another_file_is_scored_with_its_own_bias(flexarm, folder, whole, few_st
     assert result["ring_downs"] and all(ring["from_s"] > 100.0 for ring in result["ring_downs"])
 
 
-@pytest.mark.long
 def test_what_gauges_pick_up_from_the_currents_is_scored_beside_the_model(
     flexarm, folder, whole, few_steps
 ):
