@@ -66,15 +66,17 @@ LONG ?= $(if $(PYTEST_ARGS),all,none)
 REAL_TIME = $(shell grep -l real_time $(foreach folder,$(TESTS),$(wildcard $(folder)/test_*.py)))
 # Two processes with several threads each hold each other up: small matrices then take several times as long.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
+# Hundreds of processes import the same modules: each is compiled once, also where the environment forbids to keep that.
+KEEP_COMPILED := export PYTHONDONTWRITEBYTECODE=
 test: build
-	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; \
+	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; $(KEEP_COMPILED); \
 	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not real_time" --long $(LONG) $(PYTEST_ARGS) $(TESTS); others=$$?; \
 	python -m pytest -q -m real_time $(PYTEST_ARGS) $(REAL_TIME); real_time=$$?; \
 	case $$others$$real_time in 00|05|50) ;; *) exit 1 ;; esac
 
 # The inner loop: style, imports, and the unit tests that are over quickly.
 check: build
-	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; ruff check && ruff format --check -q && \
+	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; $(KEEP_COMPILED); ruff check && ruff format --check -q && \
 	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not slow and not long and not real_time" $(PYTEST_ARGS) \
 	$(wildcard src/*/test) tests/test_architecture.py
 

@@ -506,8 +506,6 @@ def install(mode, python, lock):
     # In an incomplete environment, do not run the wheels' bootstrapper at each start of pip.
     env["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
     pip = [VENV_PYTHON, "-m", "pip", "install", "--no-input", "--prefer-binary"]
-    # Python compiles a module when it is first imported; most of these packages' are not.
-    pip += ["--no-compile"]
     # empy is the one package without a wheel; build it with the pinned setuptools, not with the newest.
     pip += ["--no-build-isolation", "--only-binary", ":all:", "--no-binary", "empy"]
     # The lists are complete, so pip follows no dependency; it takes only files whose hash is in the lock.
