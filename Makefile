@@ -59,10 +59,10 @@ demo: build
 # cores. pytest's 5 means that PYTEST_ARGS selects nothing there.
 # The long ones of nodes begin: short ones at the end keep both processes busy. Files without tests in real time need
 # not be imported again for these.
-# LONG says which of the tests marked long run: none, all, or one part of several, such as 2/6. Tests that are asked for by
-# PYTEST_ARGS run, long or not.
+# LONG says which of the tests marked long run: none, all, or one part of several, such as 2/6. Tests that PYTEST_ARGS asks
+# for by -k or by a name with :: run, long or not.
 TESTS := tests $(wildcard src/*/test)
-LONG ?= $(if $(PYTEST_ARGS),all,none)
+LONG ?= $(if $(findstring -k,$(PYTEST_ARGS))$(findstring ::,$(PYTEST_ARGS)),all,none)
 REAL_TIME = $(shell grep -l real_time $(foreach folder,$(TESTS),$(wildcard $(folder)/test_*.py)))
 # Two processes with several threads each hold each other up: small matrices then take several times as long.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1

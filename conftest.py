@@ -58,8 +58,9 @@ def pytest_collection_modifyitems(config, items):
             left.append(item)
     if left:
         config.hook.pytest_deselected(items=left)
-        items[:] = [item for item in items if item not in set(left)]
-        grouped = [item for item in grouped if item not in set(left)]
+        left = set(left)
+        items[:] = [item for item in items if item not in left]
+        grouped = [item for item in grouped if item not in left]
     result = yield
     if getattr(config.option, "loadgroup", False) and not all("@" in i.nodeid for i in grouped):
         raise pytest.UsageError(

@@ -504,8 +504,8 @@ LAWS = [
         (
             "design",
             "after a motion: gains are taken however long rubbing joints let a mode ring",
-            "other is x or after.ringing(other) <",
-            "other is x or np.inf <",
+            "if other is x or _rings_longer(",
+            "if other is x or not (",
         ),
         (
             "settling",
@@ -795,13 +795,13 @@ LAWS = [
         (
             "preview",
             "a speed that is scaled on the way: the plan is dropped",
-            "or not path.began_unscaled:",
+            "or not path.kept:",
             "or path.scaled:",
         ),
         (
             "preview",
             "a speed that is scaled on the way: the plan's bending does not fade",
-            "left = path.pace(stamp_ns, offset)",
+            "left = min(path.kept, path.pace(stamp_ns, offset))",
             "left = 3.0",
         ),
         (

@@ -113,6 +113,36 @@ def test_where_the_speed_is_scaled_on_the_way_the_plan_goes_on_beside_the_slower
     assert late < 1e-4
 
 
+def test_what_has_faded_of_a_plan_does_not_come_back(two_link):
+    names, still, start = two_link.joint_names, np.zeros(2), np.array([0.0, 0.3])
+    generator = ReferenceGenerator(names)
+    generator.start(start, 0)
+    generator.sample(0)
+    data = trajectory.validate(names, names, 0, [(3000 * MS, start + 0.9, still, still, [])])
+    generator.offer(data)
+    generator.sample(0)
+    assert generator.path.kept == 1.0
+
+    def scale(stamp, factor):
+        generator.sample(stamp)
+        generator.scale(factor, 2.0, given=False)
+        return generator.path.kept
+
+    assert scale(500 * MS, 0.5) == 1.0
+    assert_allclose(scale(2000 * MS, 1.0), 0.5, atol=1e-3)
+    assert generator.path.pace(3000 * MS) > 0.9
+    assert_allclose(scale(3000 * MS, 0.2), 0.5, atol=1e-3)
+    generator.sample(3100 * MS)
+    stop = SlowedPath(generator.path, 3100 * MS, 400 * MS)
+    assert_allclose(stop.kept, 0.5, atol=1e-3)
+    # A trajectory that begins slower has no plan.
+    generator.start(start, 9000 * MS)
+    generator.sample(9001 * MS)
+    generator.offer(replace(data, stamp_ns=0, positions=data.positions - 0.1))
+    generator.sample(9002 * MS)
+    assert generator.path.scaled and generator.path.kept == 0.0
+
+
 def planned_motion(model, duration, factor=None):
     """Largest and last distance of the simulated arm from a reference that changes its speed on the way [rad]."""
     names, still, start = model.joint_names, np.zeros(2), np.array([0.0, 0.3])

@@ -350,3 +350,9 @@ def test_gains_that_let_a_mode_of_rubbing_joints_ring_longer_are_not_taken(
     )
     other = rough.task.sooner(lambda fraction, decay: None, rough.found)
     assert (other is not rough.found) == taken
+
+
+def test_ringing_is_judged_by_the_decay_that_is_lost_and_at_a_lower_speed_less_is_asked():
+    longer = design_module._rings_longer
+    assert longer(0.02, 0.03, 1.0) and not longer(0.02, 0.03, 0.5)
+    assert not longer(-0.01, -0.01, 1.0) and longer(-0.0111, -0.01, 1.0)

@@ -3,6 +3,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,7 +13,9 @@ from flexarm_bringup import cli
 from flexarm_control.robust import cache
 from flexarm_control.robust import design as design_module
 from flexarm_control.robust.recovery import Recovery
-from flexarm_studies.commands.design import _yaml
+from flexarm_control.robust.uncertain import Uncertainty
+from flexarm_dynamics.arm import arm_file
+from flexarm_studies.commands.design import _used, _yaml
 from flexarm_studies.loop import parameter_files, scenario
 from flexarm_studies.random_arms import generator
 
@@ -55,7 +58,7 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
         r"^  torque limits +payload x 1\.3: settled after 1\.\d locked periods", printed, re.M
     )
     assert re.search(
-        r"^  torque used +9\d % of the limit of joint1 at most \(payload x 1\.3: 9\d %\)",
+        r"^  torque used +9\d % of the limit of joint1; payload x 1\.3: 9\d % of the limit of joint1;",
         printed,
         re.M,
     )
@@ -257,3 +260,24 @@ def test_shipped_designs_of_several_links_bear_a_late_torque_and_a_heavier_paylo
     metrics = scenario.run_loop(loop)[1]
     assert np.rad2deg(max(metrics["peak_joint_error_rad"])) < 10.0
     assert metrics["residual_tip_rms_mm"] < residual
+
+
+@pytest.mark.parametrize(
+    ("used", "words"),
+    [
+        (None, "not looked at: no link bends, or no joint has a limit"),
+        (
+            [[0.5, 0.4], [0.6, 0.7]],
+            "50 % of the limit of joint1; payload x 1.5: 70 % of the limit of joint2; when",
+        ),
+        (
+            [[0.5, 0.4], [np.nan, np.nan]],
+            "50 % of the limit of joint1; payload x 1.5: the arm does not rest; when",
+        ),
+    ],
+)
+def test_the_card_names_the_joint_of_each_payload(used, words):
+    uncertain = Uncertainty(payload=(1.0, 1.5))
+    found = SimpleNamespace(arm=arm_file.load("two_link"), uncertainty=uncertain)
+    bears = SimpleNamespace(torque_used=None if used is None else np.array(used))
+    assert _used(found, bears).startswith(words)

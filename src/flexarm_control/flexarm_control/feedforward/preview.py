@@ -35,7 +35,8 @@ speed. The simulated arm is then held to
 .. math:: s_{ref}(t) + \dot s(t)\,\bigl(s_{plan}(t) - s_{path}(t)\bigr),
 
 where :math:`\dot s`, 1 at first, is the rate of the trajectory's time (modules `trajectory.path`,
-`trajectory.scaling`); the torque changes likewise. If the plan were dropped at once instead, the simulated arm would be
+`trajectory.scaling`); the torque changes likewise. Where the trajectory becomes faster again, the factor does not rise:
+what the regulator has damped does not come back. If the plan were dropped at once instead, the simulated arm would be
 left with its vibration: two random arms were lost when their speed was halved on the way. A trajectory whose speed is
 scaled from its start on follows the manifold.
 """
@@ -184,8 +185,8 @@ class Preview(ModelFeedforward):
         return Plan(count * period, motion, torque, period)
 
     def _planned(self, prepared, path, stamp_ns):
-        if prepared is None or prepared.plan is None or not path.began_unscaled:
-            return None  # a plan at another speed is no motion of the arm
+        if prepared is None or prepared.plan is None or not path.kept:
+            return None  # a trajectory that was slower from its start on has no plan
         elapsed_ns = stamp_ns - path.followed.start_ns
         return prepared.plan if 0 <= elapsed_ns < prepared.plan.duration * SECOND else None
 
@@ -197,7 +198,7 @@ class Preview(ModelFeedforward):
         if path is way:
             return state, torque
         stop, motion = (self._on_manifold(At(p, stamp_ns, offset)) for p in (path, way))
-        left = path.pace(stamp_ns, offset)
+        left = min(path.kept, path.pace(stamp_ns, offset))
         return stop[0] + left * (state - motion[0]), stop[1] + left * (torque - motion[1])
 
 

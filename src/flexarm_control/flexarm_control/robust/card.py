@@ -44,10 +44,11 @@ class Card:
         in the slowest configuration [s].
     slowest : float
         After this time the slowest pole of the uncertain loops has 2 % left [s].
-    torque_used : ndarray, shape (2, n)
-        Largest torque of each joint over its limit, the weight included, in a motion of any one joint of
-        `settling.ANGLE` in `settling.MOTION` locked periods: with the payload of the file, and with the heaviest; zero
-        where there is no limit, NaN where the arm does not rest [-].
+    torque_used : ndarray, shape (2, n), or None
+        Largest torque of each joint over its limit, when any one joint turns by `settling.ANGLE` in `settling.MOTION`
+        locked periods: with the payload of the file, and with the heaviest [-]. It includes the weight where the motion
+        ends, and leaves out friction and Coriolis forces. Zero for a joint without a limit, NaN if the arm does not
+        rest. None: no link bends, or no joint has a limit.
     tip_stiffness, tip_stiffness_proportional : float
         Of the tip against a static force, in the softest direction and configuration: when the integral has brought
         the joints back, so that the links alone bend, and without the integral [N/m].
@@ -61,7 +62,7 @@ class Card:
     damping: float
     settling: float
     slowest: float
-    torque_used: np.ndarray
+    torque_used: np.ndarray | None
     tip_stiffness: float
     tip_stiffness_proportional: float
 
@@ -127,18 +128,24 @@ def card(design):
         damping,
         settling,
         LEFT / slowest if slowest > 0.0 else np.inf,
-        np.array([torque_used(design, factor) for factor in (1.0, design.uncertainty.payload[1])]),
+        _torques_used(design),
         min(softest(tip.compliance())[0] for tip in tips),
         min(softest(tip.compliance(held))[0] for tip, held in zip(tips, given, strict=True)),
     )
+
+
+def _torques_used(design):
+    """`Card.torque_used` of a design."""
+    known = design.arm.known
+    if not known.most_modes or not np.isfinite(known.torque_limits).any():
+        return None
+    return np.array([torque_used(design, f) for f in (1.0, design.uncertainty.payload[1])])
 
 
 def torque_used(design, payload):
     """One row of `Card.torque_used`, (n,), with a factor of the payload [-]."""
     nominal, plant = build(design.arm.known), build(scaled(richer(design.arm.whole), payload, 1.0))
     limit, largest = np.array(nominal.arm.torque_limits), np.zeros(nominal.n_joints)
-    if not nominal.n_modes:
-        return largest
     for q in design.configurations:
         period = 2.0 * np.pi / nominal.frequencies(q, locked=True)[0]
         try:

@@ -74,9 +74,9 @@ MUCH, LESS, SOONER, PLACES = 3.5, 0.6, 800, 3
 #: The slowest pole of all loops then keeps this part of the decay that was reached. Of loops that are there for a
 #: margin, this part of what was asked is asked [-].
 KEEP, EASED = 0.8, 0.5
-#: It takes no gains with which a mode would ring longer where the joints rub: with less than this part of the decay
-#: before, and less than this over omega_1. Linear loops then leave less, simulated arms leave more.
-SHORTER, RINGS = 0.9, 0.03
+#: They are not taken if, where joints rub, the slowest pole that rings loses more than this part of its decay, and then
+#: has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
+SHORTER, RINGS = 0.1, 0.03
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
@@ -665,7 +665,7 @@ class _Task:
             LESS * most,
             lambda fraction: progress(fraction, found.decay),
         )
-        if other is x or after.ringing(other) < min(SHORTER * after.ringing(x), RINGS):
+        if other is x or _rings_longer(after.ringing(other), after.ringing(x), self.speed):
             return found
         used = found.evaluations + whole.evaluations + search.evaluations
         return self._sets(whole, other, used)
@@ -748,6 +748,11 @@ class _Task:
 def _kept(reached):
     """The least decay that the search for gains that leave less keeps, of the least that was `reached` [-]."""
     return max(KEEP * reached, min(reached, LEAST))
+
+
+def _rings_longer(now, before, speed):
+    """Whether the slowest decays that ring, where joints rub, are a reason not to take gains [-]."""
+    return now < min(before - SHORTER * abs(before), RINGS * speed)
 
 
 def _parts(loops, decays):

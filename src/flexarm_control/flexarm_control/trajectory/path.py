@@ -115,8 +115,10 @@ class Path:
 
     """
 
-    #: Whether the path's time differs from the arm's, and whether it was the arm's at its start.
-    scaled, began_unscaled = False, True
+    #: Whether the path's time differs from the arm's.
+    scaled = False
+    #: Largest fraction of a plan's bending beside the slow manifold that may still be there [-].
+    kept = 1.0
     #: The piece that a path ends in: its last state, held.
     END = -1
 
@@ -425,7 +427,7 @@ class SlowedPath:
     def __init__(self, path, start_ns, duration_ns):
         self._way, self.start_ns, self.duration_ns = path, start_ns, duration_ns
         self.followed, self.scaled = path.followed, path.scaled
-        self.began_unscaled = path.began_unscaled
+        self.kept = path.kept
         self._slowing = Slowing(duration_ns / SECOND)
         self._begin_ns = max(start_ns - path.start_ns, 0)
         self.begin_state, self._end = np.zeros((2, *path.begin_state.shape))
@@ -512,7 +514,7 @@ class FinishedPath:
         Stamp of the stop [ns].
     """
 
-    trajectory_id, scaled, began_unscaled = 0, False, True
+    trajectory_id, scaled, kept = 0, False, 1.0
 
     def __init__(self, path, start_ns):
         self.followed, self.start_ns = path, start_ns

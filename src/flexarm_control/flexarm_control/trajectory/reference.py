@@ -501,7 +501,7 @@ class ReferenceGenerator:
             duration = MAX_BRAKING
         law = path.law if path.scaled else TimeLaw(now, path.elapsed(now))
         law = law.changed(now, self.speed_scaling, max(duration, MIN_RAMP))
-        self._path = ScaledPath(path.followed, law, path.began_unscaled)
+        self._path = ScaledPath(path.followed, law, min(path.kept, path.pace(now)))
 
     def look_at(self, stamp_ns):
         """State (3, n) of the present or coming reference at a stamp `stamp_ns` [ns]; None while there is none.

@@ -86,15 +86,16 @@ class ScaledPath:
     path : Path
         A path that has begun and is not changed any more.
     law : TimeLaw
-    began_unscaled : bool
-        Whether the path's time was the arm's from its start until the law began.
+    kept : float
+        Largest fraction of a plan's bending that may still be there: the lowest rate before the law began; 0: the path
+        was scaled from its start on [-].
     """
 
     #: Whether the path's time differs from the arm's.
     scaled = True
 
-    def __init__(self, path, law, began_unscaled=False):
-        self.followed, self.law, self.began_unscaled = path, law, began_unscaled
+    def __init__(self, path, law, kept=0.0):
+        self.followed, self.law, self.kept = path, law, kept
         self.trajectory_id, self.start_ns = path.trajectory_id, path.start_ns
         self.duration_ns, self.begin_state = path.duration_ns, path.begin_state
         self._own = np.zeros_like(path.begin_state)

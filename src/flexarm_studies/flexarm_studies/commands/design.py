@@ -207,7 +207,7 @@ def _result(found, bears):
         "phase_rad": bears.phase,
         "settling_s": bears.settling,
         "slowest_settling_s": bears.slowest,
-        "torque_used": bears.torque_used.tolist(),
+        "torque_used": None if bears.torque_used is None else bears.torque_used.tolist(),
         "tip_stiffness_N_m": bears.tip_stiffness,
         "tip_stiffness_without_integral_N_m": bears.tip_stiffness_proportional,
     }
@@ -319,20 +319,23 @@ def card_lines(found, bears):
 
 def _used(found, bears):
     """The torque of a motion, in words."""
-    from flexarm_control.robust.settling import ANGLE, MOTION
+    from flexarm_control.robust.settling import ANGLE
 
-    seconds = MOTION * 2.0 * np.pi / found.omega_1
-    parts = []
-    for share, payload in zip(bears.torque_used, ("", "payload x "), strict=True):
-        k = int(np.argmax(share))  # that of a NaN, too
-        payload += f"{found.uncertainty.payload[1]:g}: " if payload else ""
-        known = np.isfinite(share[k])
-        parts.append(payload + (f"{100.0 * share[k]:.2g} %" if known else "the arm does not rest"))
-    name = found.arm.joints[int(np.argmax(bears.torque_used[0]))].name
+    if bears.torque_used is None:
+        return "not looked at: no link bends, or no joint has a limit"
+    file, heaviest = (_largest(fractions, found.arm) for fractions in bears.torque_used)
     return (
-        f"{parts[0]} of the limit of {name} at most ({parts[1]}), when one joint turns by {np.degrees(ANGLE):.0f} deg"
-        f" in two locked periods ({seconds:.3g} s)"
+        f"{file}; payload x {found.uncertainty.payload[1]:g}: {heaviest}; when one joint turns by"
+        f" {np.degrees(ANGLE):.0f} deg in two locked periods"
     )
+
+
+def _largest(fractions, arm):
+    """The largest of the joints' fractions of their limits, in words."""
+    if np.isnan(fractions).any():
+        return "the arm does not rest"
+    k = int(np.argmax(fractions))
+    return f"{100.0 * fractions[k]:.2g} % of the limit of {arm.joints[k].name}"
 
 
 def _recovery(found):
