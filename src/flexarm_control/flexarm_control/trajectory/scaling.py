@@ -87,8 +87,8 @@ class ScaledPath:
         A path that has begun and is not changed any more.
     law : TimeLaw
     kept : float
-        Largest fraction of a plan's bending that may still be there: the lowest rate before the law began; 0: the path
-        was scaled from its start on [-].
+        Largest fraction of a plan's bending that may still be there: the lowest rate at which a change of the
+        speed began; 0: the path was scaled from its start on [-].
     """
 
     #: Whether the path's time differs from the arm's.
