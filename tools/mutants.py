@@ -985,8 +985,20 @@ LIMITS = [
         (
             "channels",
             "light joints: in the first configuration alone",
-            "light = max(light, (np.diag(H)[:n] / np.diag(stiff)).max())",
-            "light = light or (np.diag(H)[:n] / np.diag(stiff)).max()",
+            "self.heavy = bool(max(light) <= LIGHT)",
+            "self.heavy = bool(light[0] <= LIGHT)",
+        ),
+        (
+            "channels",
+            "light joints: no mode more than the arm file has",
+            "fuller = model.fuller(model.arm.most_modes + 1)",
+            "fuller = model",
+        ),
+        (
+            "channels",
+            "amplitudes as gauges show them: only the modes of the file",
+            "np.maximum(bends, _largest([strain_map.inverse @ e for e in felt]), out=bends)",
+            "pass",
         ),
     ),
     *of(

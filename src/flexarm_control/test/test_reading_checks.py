@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from flexarm_control.loop.samples import ArmSample
 from flexarm_control.observers.plausibility.agreement import Agreement
 from flexarm_control.observers.plausibility.amplitudes import SourceAmplitudes
-from flexarm_control.observers.plausibility.channels import Channels
+from flexarm_control.observers.plausibility.channels import Channels, mean_accelerations
 from flexarm_control.observers.plausibility.jumps import Jumps
 from flexarm_control.observers.plausibility.low_pass import LowPass
 from flexarm_control.observers.plausibility.monitor import Monitor
@@ -18,8 +18,9 @@ from flexarm_control.observers.plausibility.standstill import Standstill
 from flexarm_control.observers.plausibility.strain_law import StrainLaw
 from flexarm_control.observers.plausibility.zero_drift import CORRECTED, SLOW
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.arm.description import scaled
-from flexarm_dynamics.arm.strain_map import StrainMap
+from flexarm_dynamics.arm.description import Friction, scaled
+from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models import model as models
 
 PERIOD = 1e-3  # [s]
@@ -486,6 +487,55 @@ def test_lost_samples_in_which_a_mode_turns_far_are_no_jump_of_the_strains():
             assert found == (None, None)
         jumps.take(value, k * period)
         last = k
+
+
+def undamped(name, modes):
+    """Model of a shipped arm without damping and friction, with so many modes, and its A and B at rest."""
+    arm = arm_file.load(name).with_modes(modes)
+    links = tuple(
+        replace(link, flexible={d: replace(f, damping=(0.0,)) for d, f in link.flexible.items()})
+        for link in arm.links
+    )
+    free = Friction()
+    arm = replace(arm, links=links, joints=tuple(replace(j, friction=free) for j in arm.joints))
+    model = models.build(arm)
+    return model, *linear_plant(model, np.zeros(model.n_joints))
+
+
+@pytest.mark.parametrize("modes", [1, 3])
+def test_a_step_of_the_torque_moves_the_arm_by_half_of_the_mean_acceleration_times_the_square(
+    modes,
+):
+    model, A, B = undamped("two_link", modes)
+    n, m = model.n_joints, model.n_modes
+    for time in (1e-4, 2e-3, 0.1):
+        moved = sampled(A, B, time)[1][: n + m]
+        means = np.vstack(mean_accelerations(model, np.zeros(n), time))
+        assert means * 0.5 * time**2 == pytest.approx(
+            moved, rel=1e-6, abs=1e-9 * np.abs(moved).max()
+        )
+
+
+@pytest.mark.parametrize("period", [1e-3, 2e-3])
+def test_modes_that_the_file_lacks_turn_a_light_joint_fast_without_a_jump(period):
+    """The torque rises and falls by steps; the arm has three modes more than the file says."""
+    file = models.build(arm_file.load("two_link").with_modes(1))
+    plant, A, B = undamped("two_link", 4)
+    channels = Channels(file, StrainMap(file))
+    jumps, n, m = Jumps(channels), plant.n_joints, plant.n_modes
+    rows = gauge_rows(plant, file.arm.gauges)
+    Phi, Gamma = sampled(A, B, period)
+    x, torque, limit = np.zeros(2 * (n + m)), np.zeros(n), 0.05 * channels.strength
+    for k in range(400):
+        if k >= 60:
+            torque = limit * np.clip([k % 40 - 18, 22 - k % 40], -1, 1).min()
+        x = Phi @ x + Gamma @ torque
+        value = np.full(channels.size, np.nan)
+        value[channels.position], value[channels.strain] = x[:n], rows @ x[n : n + m]
+        value[channels.amplitude] = StrainMap(file).inverse @ value[channels.strain]
+        outliers, _ = jumps.judge(value, torque, period, 1)
+        assert outliers is None, (k, [channels.names[i] for i in outliers])
+        jumps.take(value, (k + 1) * period)
 
 
 # --------------------------------------------------------------------------- modal amplitudes

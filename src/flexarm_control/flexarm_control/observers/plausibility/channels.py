@@ -8,7 +8,16 @@ strain map, a step :math:`\Delta u` of the torque changes the accelerations by
 .. math:: |\Delta\ddot q| \le 2|H_{11}||\Delta u|, \qquad |\Delta\ddot\delta| \le 2|H_{21}||\Delta u|, \qquad
           |\Delta\ddot\varepsilon| \le 2|R H_{21}||\Delta u| ,
 
-where the 2 allows for errors of the model.
+where the 2 allows for errors of the model. The end of a light link has hardly any inertia of its own, so that a motor
+on it turns back by modes that the arm file leaves out. Gauges feel these modes, too. So for an arm with a light joint
+each bound is also computed with a mode more, with the mean acceleration that a constant torque causes over a time t
+instead of H:
+
+.. math:: \bar H = \begin{pmatrix} M_{11}^{-1} & 0 \\ 0 & 0 \end{pmatrix}
+          + \sum_k \left(\frac{\sin(\omega_k t/2)}{\omega_k t/2}\right)^2 \phi_k\phi_k^T ,
+
+with the normal modes :math:`\phi_k` of unit modal mass and their frequencies :math:`\omega_k`. The larger bound holds.
+Without the average the sum would grow with each mode; with it, it converges.
 
 Everything else that acts (pushes, gravity, brakes) is assumed to change the joints' accelerations by at most
 :math:`2|M_{11}^{-1}|u_{max}`, with the torque limit or the brake's torque, whichever is larger. The accelerations of
@@ -19,6 +28,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from flexarm_dynamics.arm.strain_map import gauge_rows
+
 from ... import kernels
 
 #: Rms noise if the arm file states none: joint positions [rad], joint velocities [rad/s], and strains as a
@@ -28,6 +39,8 @@ UNSTATED_POSITION, UNSTATED_VELOCITY, UNSTATED_STRAIN = 1e-5, 1e-3, 1e-5
 UNSTATED_AMPLITUDE = 1e-5
 #: Factor for a payload, a configuration or a torque between two samples that is not the model's [-].
 MARGIN = 2.0
+#: Time over which accelerations after a step of the torque are averaged: two samples at 1 kHz [s].
+AVERAGED = 2e-3
 #: A joint with a larger ratio of flexible to rigid accelerations turns hardly more than the end of a bending link [-].
 LIGHT = 3.0
 #: Number of configurations over which the largest accelerations are taken.
@@ -118,29 +131,33 @@ class Channels:
     def _accelerations(self, strain_map):
         """`gain` and `push`."""
         model, n = self.model, self.n
-        joints, bends, rigid = np.zeros((n, n)), np.zeros((self.m, n)), np.zeros((n, n))
-        strains, light = np.zeros((self.g, n)), 0.0
         random = np.random.default_rng(0)
-        for k in range(CONFIGURATIONS):
-            q = random.uniform(-1.5, 1.5, n) if k else np.zeros(n)
-            M = model.terms(q, np.zeros(n)).M
-            H = np.linalg.inv(M)
-            np.maximum(joints, np.abs(H[:n, :n]), out=joints)
-            np.maximum(bends, np.abs(H[n:, :n]), out=bends)
-            stiff = np.linalg.inv(M[:n, :n])
-            np.maximum(rigid, np.abs(stiff), out=rigid)
-            light = max(light, (np.diag(H)[:n] / np.diag(stiff)).max())
-            if strain_map is not None:
-                np.maximum(strains, np.abs(strain_map.rows @ H[n:, :n]), out=strains)
-        self.heavy = bool(light <= LIGHT)
-        strength = self.strength
-        gain = MARGIN * np.vstack([joints, strains, bends, joints, bends])
-        push = np.full(self.size, np.inf)
+        places = [np.zeros(n), *random.uniform(-1.5, 1.5, (CONFIGURATIONS - 1, n))]
+        masses = [model.terms(q, np.zeros(n)).M.copy() for q in places]
+        rigid = [np.linalg.inv(M[:n, :n]) for M in masses]
+        H = [np.linalg.inv(M) for M in masses]
+        light = [(np.diag(h)[:n] / np.diag(r)).max() for h, r in zip(H, rigid, strict=True)]
+        self.heavy = bool(max(light) <= LIGHT)
+        joints = _largest([h[:n, :n] for h in H])
+        bends = _largest([h[n:, :n] for h in H])
+        strains = np.zeros((self.g, n))
+        if strain_map is not None:
+            strains = _largest([strain_map.rows @ h[n:, :n] for h in H])
+        strength, push = self.strength, np.full(self.size, np.inf)
         if np.isfinite(strength).all():
             soft = [0.05 * part @ strength for part in (strains, bends)]
-            hard = 2.0 * rigid @ strength
+            hard = 2.0 * _largest(rigid) @ strength
             push = np.concatenate([hard, *soft, hard, soft[1]])
-        return gain, push
+        if not self.heavy:
+            fuller = model.fuller(model.arm.most_modes + 1)
+            means = [mean_accelerations(fuller, q, AVERAGED) for q in places]
+            np.maximum(joints, _largest([each for each, _ in means]), out=joints)
+            if strain_map is not None:
+                rows = gauge_rows(fuller, model.arm.gauges)
+                felt = [rows @ each for _, each in means]
+                np.maximum(strains, _largest(felt), out=strains)
+                np.maximum(bends, _largest([strain_map.inverse @ e for e in felt]), out=bends)
+        return MARGIN * np.vstack([joints, strains, bends, joints, bends]), push
 
     def read(self, sample, out, raw):
         """Read an `ArmSample` into `out`, shape (N,), and its (q, strain, qd) into `raw`, (2 n + g,)."""
@@ -153,3 +170,35 @@ class Channels:
             out,
             raw,
         )
+
+
+def _largest(arrays):
+    """Largest magnitude of each element."""
+    return np.abs(arrays).max(axis=0)
+
+
+def mean_accelerations(model, q, time):
+    """Mean accelerations after a step of the torques, per torque: the two blocks of the module's H, averaged.
+
+    Parameters
+    ----------
+    model : ArmModel
+        n joints, m modes.
+    q : ndarray, shape (n,)
+        Joint angles [rad].
+    time : float
+        Over which they are averaged: a motion from rest covers half of them times the time's square [s].
+
+    Returns
+    -------
+    joints : ndarray, shape (n, n)
+        Of the joints [1/(kg m^2)].
+    bends : ndarray, shape (m, n)
+        Of the modal amplitudes, in their unit per s^2 and N m.
+    """
+    n = model.n_joints
+    omega, shapes = model.normal_modes(q)
+    weighted = shapes * np.sinc(omega * time / (2.0 * np.pi)) ** 2
+    both = weighted @ shapes[:n].T
+    both[:n] += np.linalg.inv(model.terms(q, np.zeros(n)).M[:n, :n])
+    return both[:n], both[n:]
