@@ -93,7 +93,7 @@ wheel: build
 
 # Wrong signs, factors and limits, put in one at a time: a test must fail for each.
 mutants: build
-	@. tools/env.sh && python tools/mutants.py $(MUTANTS_ARGS)
+	@. tools/env.sh && python -m tools.mutants $(MUTANTS_ARGS)
 
 # In a directory of its own: what Sphinx needs does not go with what colcon needs.
 DOCS_TOOLS := results/docs/tools
