@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 
 from flexarm_control.motions import profiles
-from flexarm_control.nodes.controller_report import Report
+from flexarm_control.nodes.controller_report import SWINGS, Report
 from flexarm_control.robust import cache, default
 from flexarm_dynamics.arm import arm_file
 from flexarm_ros.node import WARN
@@ -125,6 +125,11 @@ def test_the_delay_of_the_loop_is_measured_and_compared_with_what_the_design_bea
         message = lockstep.trajectory_message(names, profile, 51, TRAJECTORY_START_NS)
         nodes.record(message, 0.2)
         level, text, values = nodes.nodes["controller"].diagnose()
+        swings = nodes.nodes["controller"].design._replace(comes_back=False)
+        parts = nodes.nodes["controller"], nodes.nodes["controller"].core, swings
+        warned = Report(*parts).diagnose()
+        del parts
+    assert warned[:2] == (WARN, SWINGS)
     assert values["speed of the design"] == "1"
     assert float(values["torque delay p50 [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)
     assert float(values["torque delay max [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)

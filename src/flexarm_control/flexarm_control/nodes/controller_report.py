@@ -10,6 +10,8 @@ from ..loop.supervisor import State
 
 #: Fraction by which the rate of states may differ from the design's.
 OTHER_RATE = 0.2
+#: Warning about a design with which the arm does not come back from its torque limits.
+SWINGS = "at the torque limits the arm may swing: give motions more time"
 
 
 class Report:
@@ -100,7 +102,7 @@ class Report:
         if design.slowed:
             speed += ", lowered because of the torque limits"
         if not design.comes_back:
-            speed += "; at the torque limits the arm may swing: give motions more time"
+            speed += f"; {SWINGS}"
         return {
             "designed for a delay of [ms]": _milliseconds(design.delay),
             "bears a delay of [ms]": _milliseconds(design.bears_delay),
@@ -150,6 +152,8 @@ class Report:
             return WARN, f"torque at its limit in {saturated} of {rate} samples"
         if core.reason:
             return WARN, core.reason
+        if self._design is not None and not self._design.comes_back:
+            return WARN, SWINGS
         if not core.fast_enabled:
             return WARN, "the fast control is off: call ~/enable_fast with data true"
         return OK, ""
