@@ -51,8 +51,8 @@ class Client:
             nonlocal again
             if (
                 time.monotonic() > again
-            ):  # a server that has not found the client yet drops its answer
-                again = time.monotonic() + 3.0
+            ):  # a server that has not found the client yet drops its answer; a busy one takes seconds
+                again = time.monotonic() + 10.0
                 futures.append(
                     self.client.send_goal_async(
                         self.kind.Goal(trajectory=message, **fields),
