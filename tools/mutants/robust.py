@@ -136,7 +136,7 @@ ERRORS = [
             "            if False:\n",
         ),
         (
-            "design",
+            "further",
             "after a motion: gains are taken however long rubbing joints let a mode ring",
             "if other is x or _rings_longer(",
             "if other is x or not (",
@@ -148,16 +148,22 @@ ERRORS = [
             "for k, one in self._residuals)",
         ),
         (
-            "design",
+            "further",
             "after a motion: every design goes on",
-            "min(decays) <= 0.0 or after(x)[0] < most",
-            "min(decays) <= 0.0",
+            "if leaves >= one.much / task.speed",
+            "if leaves >= 0.0",
+        ),
+        (
+            "further",
+            "after a motion: all loops are asked as much as before",
+            "yield eased if loop.kind == MARGIN else least",
+            "yield least",
         ),
         (
             "design",
-            "after a motion: all loops are asked as much as before",
-            "yield EASED if loop.kind == MARGIN else least",
-            "yield least",
+            "after a motion: gains are taken with which the arm does not come back",
+            "if sooner.comes_back or not made.comes_back:",
+            "if True:",
         ),
         (
             "settling",

@@ -230,12 +230,12 @@ def by_speed(monkeypatch, found):
     """`recovery` of designs of each speed; the speeds that are asked come into the list."""
     asked = []
 
-    class Task(design_module._Task):
+    class Task(design_module.Task):
         def __init__(self, arm, settings, *rest, **named):
             asked.append(settings.speed)
             super().__init__(arm, settings, *rest, **named)
 
-    monkeypatch.setattr(design_module, "_Task", Task)
+    monkeypatch.setattr(design_module, "Task", Task)
     monkeypatch.setattr(design_module, "recovery", lambda *_: found(asked[-1]))
     return asked
 

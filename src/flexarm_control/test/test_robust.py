@@ -246,14 +246,15 @@ def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed
         assert {row.name.split(", at")[0] for row in design_.slowest} & alone == more
     assert found.evaluations > designed.evaluations
     nearby = design_module.FIRST * design_module.NEARBY
-    assert fractions == sorted(fractions) and nearby == pytest.approx(fractions[-3])
+    assert fractions == sorted(fractions)
+    assert any(part == pytest.approx(nearby) for part in fractions)
 
 
 @pytest.mark.long
 def test_sets_of_gains_that_are_slow_go_on_from_gains_nearby_together(two_link, monkeypatch):
     at = ((0.0, 0.4), (0.0, 1.0))
     settings = Settings(rate=500.0, delay=0.002, effort=0.02, configurations=at)
-    task = design_module._Task(two_link.arm, settings, Uncertainty())
+    task = design_module.Task(two_link.arm, settings, Uncertainty())
     found = task.found(None, None, -np.inf)
     monkeypatch.setattr(design_module, "TRIES", 100)
     monkeypatch.setattr(design_module, "SLOW", 10.0)

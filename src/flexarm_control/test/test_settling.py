@@ -10,9 +10,12 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from flexarm_control.robust import design as design_module
+from flexarm_control.robust import further
 from flexarm_control.robust import search as search_module
 from flexarm_control.robust.design import Settings, design, sampling_for
+from flexarm_control.robust.further import FURTHER, LESS, Further, leaving_less
 from flexarm_control.robust.loop import ARM, MARGIN, STICKS, sampled_loop
+from flexarm_control.robust.recovery import Recovery
 from flexarm_control.robust.settling import (
     ANGLE,
     MOTION,
@@ -35,10 +38,12 @@ UNCERTAIN = Uncertainty()
 
 @pytest.fixture(scope="module")
 def r():
-    """Arm R, its sampling at 500 Hz, and gains that hold it: a stiff, well damped joint."""
+    """Arm R, its sampling at 500 Hz, and gains that hold it, without the further search."""
     model = build(arm_file.load("R").known)
     sampling, _ = sampling_for(model, np.zeros((1, 1)), Settings(500.0, 0.002))
-    found = design(model.arm, Settings(500.0, 0.002, effort=0.3))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(further, "FURTHER", ())
+        found = design(model.arm, Settings(500.0, 0.002, effort=0.3))
     return SimpleNamespace(model=model, sampling=sampling, K=found.K, design=found)
 
 
@@ -187,9 +192,9 @@ def test_an_arm_that_is_what_its_file_says_leaves_nothing(r):
 
 def lasting(found):
     """J of a design, and its settling time in locked periods."""
-    task = design_module._Task(found.arm, found.settings, found.uncertainty)
-    loops, weights = task._held(found.sampling, len(found.sets))
-    search = task._together_search(loops, weights, found.sampling)
+    task = design_module.Task(found.arm, found.settings, found.uncertainty)
+    loops, weights = task.held(found.sampling, len(found.sets))
+    search = task.search_of(loops, weights, found.sampling)
     rest = [(0, one) for one in residuals(task.nominal, task.at[0], found.sampling, UNCERTAIN)]
     after, x = AfterMotion(search.slowest, rest), search.slowest.scaled(found.sets)
     return after(x)[0], after.settling(x), -search.value(x)
@@ -197,7 +202,7 @@ def lasting(found):
 
 def test_a_design_whose_motions_leave_much_goes_on_for_gains_that_leave_less(r, monkeypatch):
     before, settled, reached = lasting(r.design)
-    monkeypatch.setattr(design_module, "MUCH", 0.9 * before)
+    monkeypatch.setattr(further, "FURTHER", (Further(0.9 * before, 800, 0.5),))
     fractions = []
     other = design(r.model.arm, r.design.settings, progress=lambda part, _: fractions.append(part))
     first = design_module.FIRST
@@ -210,7 +215,7 @@ def test_a_design_whose_motions_leave_much_goes_on_for_gains_that_leave_less(r, 
 def test_a_slow_design_may_leave_more(r, monkeypatch):
     settings = replace(r.design.settings, speed=0.5)
     slow = design(r.model.arm, settings)
-    monkeypatch.setattr(design_module, "MUCH", 0.6 * lasting(slow)[0])
+    monkeypatch.setattr(further, "FURTHER", (Further(0.6 * lasting(slow)[0], 800, 0.5),))
     assert_allclose(design(r.model.arm, settings).K, slow.K, rtol=0.0)
 
 
@@ -220,12 +225,12 @@ def rough(r):
     joints = tuple(
         replace(j, friction=replace(j.friction, coulomb=0.1)) for j in r.model.arm.joints
     )
-    task = design_module._Task(replace(r.model.arm, joints=joints), r.design.settings, UNCERTAIN)
-    loops, weights = task._held(r.design.sampling, 1)
-    search = task._together_search(loops, weights, r.design.sampling)
+    task = design_module.Task(replace(r.model.arm, joints=joints), r.design.settings, UNCERTAIN)
+    loops, weights = task.held(r.design.sampling, 1)
+    search = task.search_of(loops, weights, r.design.sampling)
     x = search.slowest.scaled(r.design.sets)
     return SimpleNamespace(
-        task=task, loops=loops, search=search, x=x, found=task._sets(search, x, 0)
+        task=task, loops=loops, search=search, x=x, found=task.sets(search, x, 0)
     )
 
 
@@ -242,7 +247,7 @@ def test_loops_for_a_margin_are_eased_and_an_arm_that_moves_keeps_a_least_decay(
     loops = [SimpleNamespace(kind=kind) for kind in (ARM, ARM, MARGIN, STICKS)]
 
     def parts(*decays):
-        return list(design_module._parts(loops, decays))
+        return list(further._parts(loops, decays, 0.5))
 
     assert parts(0.2, 0.5, 0.3, 0.4) == [1.0, 1.0, 0.5, 1.0]
     # With 0.02 kept of all: 0.05 of what moves, or all that it has.
@@ -254,8 +259,8 @@ def test_the_further_search_keeps_four_fifths_of_the_slowest_decay_and_half_of_t
 ):
     left = residuals(rough.task.nominal, np.zeros(1), rough.found.sampling, UNCERTAIN)
     after = AfterMotion(rough.search.slowest, [(0, one) for one in left])
-    monkeypatch.setattr(design_module, "MUCH", 0.9 * after(rough.x)[0])
-    monkeypatch.setattr(design_module, "LESS", 0.0)
+    monkeypatch.setattr(further, "FURTHER", (Further(0.9 * after(rough.x)[0], 800, 0.5),))
+    monkeypatch.setattr(further, "LESS", 0.0)
     asked = []
     taken = search_module.Search.sooner
     monkeypatch.setattr(
@@ -263,8 +268,8 @@ def test_the_further_search_keeps_four_fifths_of_the_slowest_decay_and_half_of_t
         "sooner",
         lambda self, *args: asked.append(self.slowest.loops) or taken(self, *args),
     )
-    other = rough.task.sooner(lambda fraction, decay: None, rough.found)
-    assert other is not rough.found
+    other = leaving_less(rough.task, rough.found, lambda fraction, decay: None)
+    assert other is not None
     assert after(rough.search.slowest.scaled(other.K))[0] < 0.85 * after(rough.x)[0]
     before = rough.search.decays(rough.x)
     now = rough.search.decays(rough.search.slowest.scaled(other.K))
@@ -274,10 +279,62 @@ def test_the_further_search_keeps_four_fifths_of_the_slowest_decay_and_half_of_t
         assert new > 0.78 * eased * min(before), loop.name
 
 
+@pytest.mark.parametrize(
+    ("leaves", "speed", "chosen"),
+    [(3.6, 1.0, 0), (3.4, 1.0, 1), (2.1, 1.0, 1), (1.9, 1.0, None), (3.4, 0.5, None)],
+)
+def test_margins_are_eased_only_where_motions_leave_very_much(
+    rough, monkeypatch, leaves, speed, chosen
+):
+    asked = []
+
+    def sooner(self, x, after, keep, budget, enough, progress):
+        asked.append((self.slowest.loops, budget, enough))
+        return x
+
+    monkeypatch.setattr(search_module.Search, "sooner", sooner)
+    monkeypatch.setattr(AfterMotion, "__call__", lambda self, x: (leaves, 0.0 * x))
+    monkeypatch.setattr(rough.task, "speed", speed)
+    assert leaving_less(rough.task, rough.found, lambda fraction, decay: None) is None
+    if chosen is None:
+        assert not asked
+        return
+    ((loops, budget, enough),) = asked
+    eased = [new.fraction / old.fraction for new, old in zip(loops, rough.loops, strict=True)]
+    wanted = FURTHER[chosen]
+    assert eased == [wanted.eased if loop.kind == MARGIN else 1.0 for loop in rough.loops]
+    assert budget == rough.task.settings.effort * wanted.evaluations
+    assert enough == LESS * wanted.much
+    assert FURTHER[0].eased < FURTHER[1].eased == 1.0
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "taken"),
+    [(0.5, 0.6, True), (0.5, np.inf, False), (np.inf, np.inf, True), (np.inf, 0.5, True)],
+)
+def test_gains_that_leave_less_are_not_taken_where_they_alone_do_not_come_back(
+    monkeypatch, before, now, taken
+):
+    """Times by which torque limits delay the arm, with the gains before and those of the further search."""
+    arm, times, found = arm_file.load("R"), iter([before, now]), []
+    monkeypatch.setattr(
+        design_module, "recovery", lambda *_: Recovery(1.0 + (late := next(times)), 1.0, late)
+    )
+
+    def leaving(task, sets, progress):
+        found.append(1.01 * sets.K)
+        return sets._replace(K=found[0])
+
+    monkeypatch.setattr(design_module, "leaving_less", leaving)
+    quick = Settings(500.0, 0.002, effort=0.02)
+    made = design_module.design_at(arm, quick, UNCERTAIN)
+    assert np.array_equal(made.sets, found[0]) == taken
+
+
 def test_gains_that_would_be_slower_than_asked_are_not_taken(r, monkeypatch):
-    task = design_module._Task(r.design.arm, r.design.settings, UNCERTAIN)
-    loops, weights = task._held(r.design.sampling, 1)
-    search = task._together_search(loops, weights, r.design.sampling)
+    task = design_module.Task(r.design.arm, r.design.settings, UNCERTAIN)
+    loops, weights = task.held(r.design.sampling, 1)
+    search = task.search_of(loops, weights, r.design.sampling)
     x = search.slowest.scaled(r.design.sets)
     reached = -search.value(x)
 
@@ -343,16 +400,16 @@ def test_gains_that_let_a_mode_of_rubbing_joints_ring_longer_are_not_taken(
     rough, monkeypatch, before, now, taken
 ):
     x = rough.search.slowest.scaled(rough.found.K)
-    monkeypatch.setattr(design_module, "MUCH", 1e-3)
+    monkeypatch.setattr(further, "FURTHER", (Further(1e-3, 800, 0.5),))
     monkeypatch.setattr(search_module.Search, "sooner", lambda self, x, *_: 1.01 * x)
     monkeypatch.setattr(
         AfterMotion, "ringing", lambda self, y: before if np.array_equal(x, y) else now
     )
-    other = rough.task.sooner(lambda fraction, decay: None, rough.found)
-    assert (other is not rough.found) == taken
+    other = leaving_less(rough.task, rough.found, lambda fraction, decay: None)
+    assert (other is not None) == taken
 
 
 def test_ringing_is_judged_by_the_decay_that_is_lost_and_at_a_lower_speed_less_is_asked():
-    longer = design_module._rings_longer
+    longer = further._rings_longer
     assert longer(0.02, 0.03, 1.0) and not longer(0.02, 0.03, 0.5)
     assert not longer(-0.01, -0.01, 1.0) and longer(-0.0111, -0.01, 1.0)

@@ -27,12 +27,12 @@ from ..feedforward.model import METHOD
 from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
+from .further import LEAST, leaving_less
 from .held import held_loops
-from .loop import ARM, MARGIN, STICKS, Sampling
+from .loop import ARM, STICKS, Sampling
 from .noise import Noise
 from .recovery import Recovery, recovery
 from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
-from .settling import AfterMotion, residuals
 from .uncertain import (
     Uncertainty,
     configurations,
@@ -61,22 +61,13 @@ FROM_LIMITS = "an arm with faster gains would not come back from them in time"
 #: Where scheduled gains reach less of the decay than this, low passes are tried that end the torque's reach: of faster
 #: modes only their own damping is asked. Taken where the decay is so many times larger [-].
 POOR, WORTH = 0.25, 1.2
-#: Where those reach less than this, one set for all is tried, too; the same without them [-].
-LITTLE, LEAST = 0.08, 0.05
+#: Where those reach less than this, one set for all is tried, too; the same without them, where that is below
+#: `further.LEAST` [-].
+LITTLE = 0.08
 #: Where the decay that is reached is less than this, the search goes on from gains nearby, at most so many times, and
 #: looks at arms of which payload or stiffness alone differs, too. Then it does so for the loops that do not limit the
 #: others, which keep this decay [-].
 SLOW, TRIES, KEPT = 0.2, 6, 0.055
-#: Where motions leave more than this on arms that are not the file's (`settling.AfterMotion`), the search goes on for
-#: gains that leave less, down to this part of it, in at most so many evaluations; in fewer for more configurations
-#: than these.
-MUCH, LESS, SOONER, PLACES = 3.5, 0.6, 800, 3
-#: The slowest pole of all loops then keeps this part of the decay that was reached. Of loops that are there for a
-#: margin, this part of what was asked is asked [-].
-KEEP, EASED = 0.8, 0.5
-#: They are not taken if, where joints rub, the slowest pole that rings loses more than this part of its decay, and then
-#: has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
-SHORTER, RINGS = 0.1, 0.03
 #: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
 QUICK = 12
 #: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
@@ -483,25 +474,28 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
 
 def design_at(arm, settings, uncertainty, progress=None, gains=None):
     """A `Design` of the speed that is given, whether or not it comes back from the torque limits; see `design`."""
-    task, say = _Task(arm, settings, uncertainty), _Progress(progress)
+    task, say = Task(arm, settings, uncertainty), _Progress(progress)
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
-        short = _Task(arm, settings, uncertainty, short=True)
+        short = Task(arm, settings, uncertainty, short=True)
         other = short.found(say.part(USUAL, OTHERWISE), gains, LITTLE)
         if max(found.decay, other.decay) < LEAST:
             found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
         if other.decay > max(WORTH * found.decay, 0.0):
             task, found = short, other
     if found.decay < SLOW * task.speed:
-        task = _Task(arm, settings, replace(uncertainty, edges=True), task.short)
+        task = Task(arm, settings, replace(uncertainty, edges=True), task.short)
         found = task.from_nearby(say.part(OTHERWISE, NEARBY), found)
+    made = task.design(found)
     if found.decay > 0.0 and task.nominal.n_modes:
-        edged = _Task(arm, settings, replace(uncertainty, edges=True), task.short)
-        other = edged.sooner(say.part(NEARBY, 1.0), found)
-        if other is not found:
-            task, found = edged, other
-    say.part(0.0, 1.0)(1.0, found.decay)
-    return task.design(found)
+        edged = Task(arm, settings, replace(uncertainty, edges=True), task.short)
+        other = leaving_less(edged, found, say.part(NEARBY, 1.0))
+        if other is not None:
+            sooner = edged.design(other)
+            if sooner.comes_back or not made.comes_back:
+                made = sooner
+    say.part(0.0, 1.0)(1.0, made.decay)
+    return made
 
 
 class _Progress:
@@ -521,7 +515,7 @@ class _Progress:
         return say
 
 
-class _Sets(NamedTuple):
+class Sets(NamedTuple):
     """Gains of each configuration, and what they do."""
 
     K: np.ndarray  # (k, n, 3n + 2m); one set, or one for each configuration
@@ -538,8 +532,26 @@ class _Sets(NamedTuple):
         return -max(row.value for row in self.rows)
 
 
-class _Task:
-    """One design: what is searched, in one set of gains or in several; `short`: with low passes that end the reach."""
+class Task:
+    """One design: what is searched, in one set of gains or in several.
+
+    Parameters
+    ----------
+    arm : Arm
+    settings : Settings
+    uncertainty : Uncertainty
+    short : bool
+        Whether the torque has low passes that end its reach.
+
+    Attributes
+    ----------
+    nominal : ArmModel
+        Of the arm as the control knows it.
+    at : ndarray, shape (k, n)
+        Configurations [rad].
+    speed : float
+        Of the settings, and at least `SLOWEST` [-].
+    """
 
     def __init__(self, arm, settings, uncertainty, short=False):
         self.short = short
@@ -579,7 +591,7 @@ class _Task:
         chosen, x = race(searches, self.settings.effort, progress)
         search, used = searches[chosen][0], sum(one.evaluations for one, _ in searches)
         if len(self.at) == 1:
-            return self._sets(search, x, used)
+            return self.sets(search, x, used)
         return self._together(search.slowest.gains(x)[None], search.sampling, used)
 
     def scheduled(self, progress, gains):
@@ -605,9 +617,9 @@ class _Task:
         return self._together(K, searches[chosen][0].sampling, used)
 
     def _together(self, K, sampling, used):
-        """`_Sets` that hold between the configurations, too, from gains K (1 or k, n, 3n + 2m) that hold in them."""
-        loops, weights = self._held(sampling, len(K))
-        search = whole = self._together_search(loops, weights, sampling)
+        """`Sets` that hold between the configurations, too, from gains K (1 or k, n, 3n + 2m) that hold in them."""
+        loops, weights = self.held(sampling, len(K))
+        search = whole = self.search_of(loops, weights, sampling)
         x, relaxed = whole.slowest.scaled(K), set()
         for _ in range(ROUNDS):
             x = search.refined(x, self.settings.effort * TOGETHER)[1]
@@ -616,65 +628,29 @@ class _Task:
             relaxed |= near
             if asked is None:
                 break
-            search = self._together_search(asked, weights, sampling)
-        return self._sets(whole, x, used)
+            search = self.search_of(asked, weights, sampling)
+        return self.sets(whole, x, used)
 
     def from_nearby(self, progress, found):
         """The best of what the search reaches from the gains that were `found` and nearby, see `nearby`."""
-        loops, weights = self._held(found.sampling, len(found.K))
-        whole = self._together_search(loops, weights, found.sampling)
+        loops, weights = self.held(found.sampling, len(found.K))
+        whole = self.search_of(loops, weights, found.sampling)
         x, used = whole.slowest.scaled(found.K), found.evaluations
         rest = round(TRIES * self.settings.effort), SLOW * self.speed, self.settings.seed, progress
         value, x = nearby(whole, x, *rest)
         asked, _ = whole.relaxed(x, least=KEPT)
         if asked is not None and value > -SLOW * self.speed:
-            others = self._together_search(asked, weights, found.sampling)
+            others = self.search_of(asked, weights, found.sampling)
             _, x = nearby(others, x, *rest)
             used += others.evaluations
-        return self._sets(whole, x, used + whole.evaluations)
+        return self.sets(whole, x, used + whole.evaluations)
 
-    def sooner(self, progress, found):
-        """Gains near those that were `found` with which motions leave less behind, where these leave much."""
-        loops, weights = self._held(found.sampling, len(found.K))
-        whole = self._together_search(loops, weights, found.sampling)
-        left = [
-            (min(k, len(found.K) - 1), one)
-            for k, q in enumerate(self.at)
-            for one in residuals(self.nominal, q, found.sampling, self.uncertainty)
-        ]
-        after, x = AfterMotion(whole.slowest, left), whole.slowest.scaled(found.K)
-        most, decays = MUCH / self.speed, whole.decays(x)
-        if not left or min(decays) <= 0.0 or after(x)[0] < most:
-            return found
-        eased = [
-            replace(one, fraction=part * one.fraction)
-            for one, part in zip(loops, _parts(loops, decays), strict=True)
-        ]
-        search = self._together_search(eased, weights, found.sampling)
-        # A pole that hardly moves with the gains counts where less is asked of it.
-        reached = min(decays + search.decays(x))
-        if reached <= 0.0:
-            return found
-        keep = _kept(reached)
-        budget = SOONER * self.settings.effort * min(1.0, PLACES / len(self.at))
-        other = search.sooner(
-            x,
-            after,
-            keep,
-            max(1, round(budget)),
-            LESS * most,
-            lambda fraction: progress(fraction, found.decay),
-        )
-        if other is x or _rings_longer(after.ringing(other), after.ringing(x), self.speed):
-            return found
-        used = found.evaluations + whole.evaluations + search.evaluations
-        return self._sets(whole, other, used)
-
-    def _held(self, sampling, count):
+    def held(self, sampling, count):
         """Loops at and between the configurations, and the weights of `count` sets of gains in each."""
         return held_loops(self.nominal, self.at, sampling, self.uncertainty, count)
 
-    def _together_search(self, loops, weights, sampling):
+    def search_of(self, loops, weights, sampling):
+        """The `Search` for sets of gains, of which each of the loops has the mean with `weights` of its own."""
         wanted = self._wanted(sampling.torque_corner)
         slowest = SlowestScheduled(loops, wanted, self.scale, weights)
         noise = Noise(slowest, self.nominal, sampling, self.speed * NOISIEST, self.omega_1)
@@ -708,8 +684,8 @@ class _Task:
         search = Search(slowest, noise, self.speed * FASTEST, handicap, samples)
         return search, [slowest.scaled(K) for K in starts]
 
-    def _sets(self, search, x, used):
-        """`_Sets` of a search's scaled gains x."""
+    def sets(self, search, x, used):
+        """`Sets` of a search's scaled gains x."""
         slowest, rows, left, slopes = search.slowest, [], [], []
         for one in slowest.values(x):
             v, slope, _, s, unmoved = slowest.worst([one])
@@ -719,10 +695,10 @@ class _Task:
         K = slowest.gains(x).reshape(-1, *self.scale.shape)
         noise = np.max([search.noise.shares(one) for one in K], axis=0)
         slope = slopes[int(np.argmax([row.value for row in rows]))]
-        return _Sets(K, search.sampling, tuple(rows), tuple(sorted(set(left))), noise, slope, used)
+        return Sets(K, search.sampling, tuple(rows), tuple(sorted(set(left))), noise, slope, used)
 
     def design(self, sets):
-        """The `Design` with these `_Sets`."""
+        """The `Design` with these `Sets`."""
         return Design(
             self.arm,
             self.settings,
@@ -743,28 +719,6 @@ class _Task:
             if sets.decay > 0.0
             else None,
         )
-
-
-def _kept(reached):
-    """The least decay that the search for gains that leave less keeps, of the least that was `reached` [-]."""
-    return max(KEEP * reached, min(reached, LEAST))
-
-
-def _rings_longer(now, before, speed):
-    """Whether the slowest decays that ring, where joints rub, are a reason not to take gains [-]."""
-    return now < min(before - SHORTER * abs(before), RINGS * speed)
-
-
-def _parts(loops, decays):
-    """Of the decay that each loop is asked, the part that is asked of it in that search.
-
-    `EASED` of loops that are there for a margin. A loop of the moving arm keeps `LEAST`, or what it has, also where the
-    slowest of all loops is slower.
-    """
-    keep = _kept(min(decays))
-    for loop, own in zip(loops, decays, strict=True):
-        least = max(min(own, LEAST) / keep, 1.0) if loop.kind == ARM else 1.0
-        yield EASED if loop.kind == MARGIN else least
 
 
 def units(model, at, omega_1):

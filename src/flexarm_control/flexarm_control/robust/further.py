@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search that goes on from gains that hold, for gains with which motions leave less behind."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from .loop import ARM, MARGIN
+from .settling import AfterMotion, residuals
+
+#: The slowest pole of all loops keeps this part of the decay that was reached; where that is less than the second
+#: number, all of it [-].
+KEEP, LEAST = 0.8, 0.05
+#: The search ends where motions leave this part of what is much [-]. It takes fewer evaluations for more configurations
+#: than the second number.
+LESS, PLACES = 0.6, 3
+#: Its gains are not taken if, where joints rub, the slowest pole that rings loses more than this part of its decay, and
+#: then has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
+SHORTER, RINGS = 0.1, 0.03
+
+
+class Further(NamedTuple):
+    """A search for gains that leave less, and when it is made."""
+
+    much: float  # J of `settling.AfterMotion` above which it is made, at full speed [-]
+    evaluations: int  # at most
+    eased: float  # part of what was asked that loops are asked that are there for a margin [-]
+
+
+#: The first one that applies. Where motions leave very much, margins are paid for it.
+FURTHER = (Further(3.5, 800, 0.5), Further(2.0, 400, 1.0))
+
+
+def leaving_less(task, found, progress):
+    """Gains near those that were found with which motions leave less behind, where these leave much.
+
+    Parameters
+    ----------
+    task : design.Task
+    found : design.Sets
+        They hold.
+    progress : callable
+        Called with a fraction of the work, and the decay that was found.
+
+    Returns
+    -------
+    design.Sets or None
+        None if nothing is searched, or nothing better found.
+    """
+    loops, weights = task.held(found.sampling, len(found.K))
+    whole = task.search_of(loops, weights, found.sampling)
+    left = [
+        (min(k, len(found.K) - 1), one)
+        for k, q in enumerate(task.at)
+        for one in residuals(task.nominal, q, found.sampling, task.uncertainty)
+    ]
+    after, x = AfterMotion(whole.slowest, left), whole.slowest.scaled(found.K)
+    decays = whole.decays(x)
+    if not left or min(decays) <= 0.0:
+        return None
+    leaves = after(x)[0]
+    chosen = next((one for one in FURTHER if leaves >= one.much / task.speed), None)
+    if chosen is None:
+        return None
+    eased = [
+        replace(one, fraction=part * one.fraction)
+        for one, part in zip(loops, _parts(loops, decays, chosen.eased), strict=True)
+    ]
+    search = task.search_of(eased, weights, found.sampling)
+    # A pole that hardly moves with the gains counts where less is asked of it.
+    reached = min(decays + search.decays(x))
+    if reached <= 0.0:
+        return None
+    budget = chosen.evaluations * task.settings.effort * min(1.0, PLACES / len(task.at))
+    other = search.sooner(
+        x,
+        after,
+        _kept(reached),
+        max(1, round(budget)),
+        LESS * chosen.much / task.speed,
+        lambda fraction: progress(fraction, found.decay),
+    )
+    if other is x or _rings_longer(after.ringing(other), after.ringing(x), task.speed):
+        return None
+    used = found.evaluations + whole.evaluations + search.evaluations
+    return task.sets(whole, other, used)
+
+
+def _kept(reached):
+    """The least decay that the search keeps, of the least that was `reached` [-]."""
+    return max(KEEP * reached, min(reached, LEAST))
+
+
+def _rings_longer(now, before, speed):
+    """Whether the slowest decays that ring, where joints rub, are a reason not to take gains [-]."""
+    return now < min(before - SHORTER * abs(before), RINGS * speed)
+
+
+def _parts(loops, decays, eased):
+    """Of the decay that each loop is asked, the part that is asked of it in the search.
+
+    `eased` of loops that are there for a margin. A loop of the moving arm keeps `LEAST`, or what it has, also where the
+    slowest of all loops is slower.
+    """
+    keep = _kept(min(decays))
+    for loop, own in zip(loops, decays, strict=True):
+        least = max(min(own, LEAST) / keep, 1.0) if loop.kind == ARM else 1.0
+        yield eased if loop.kind == MARGIN else least
