@@ -13,7 +13,7 @@ from flexarm_control.robust import design as design_module
 from flexarm_control.robust import further
 from flexarm_control.robust import search as search_module
 from flexarm_control.robust.design import Settings, design, sampling_for
-from flexarm_control.robust.further import FURTHER, LESS, Further, leaving_less
+from flexarm_control.robust.further import FURTHER, Further, leaving_less
 from flexarm_control.robust.loop import ARM, MARGIN, STICKS, sampled_loop
 from flexarm_control.robust.recovery import Recovery
 from flexarm_control.robust.settling import (
@@ -202,7 +202,7 @@ def lasting(found):
 
 def test_a_design_whose_motions_leave_much_goes_on_for_gains_that_leave_less(r, monkeypatch):
     before, settled, reached = lasting(r.design)
-    monkeypatch.setattr(further, "FURTHER", (Further(0.9 * before, 800, 0.5),))
+    monkeypatch.setattr(further, "FURTHER", (Further(0.9 * before, 0.54 * before, 800, 0.5),))
     fractions = []
     other = design(r.model.arm, r.design.settings, progress=lambda part, _: fractions.append(part))
     first = design_module.FIRST
@@ -215,7 +215,7 @@ def test_a_design_whose_motions_leave_much_goes_on_for_gains_that_leave_less(r, 
 def test_a_slow_design_may_leave_more(r, monkeypatch):
     settings = replace(r.design.settings, speed=0.5)
     slow = design(r.model.arm, settings)
-    monkeypatch.setattr(further, "FURTHER", (Further(0.6 * lasting(slow)[0], 800, 0.5),))
+    monkeypatch.setattr(further, "FURTHER", (Further(0.6 * lasting(slow)[0], 0.0, 800, 0.5),))
     assert_allclose(design(r.model.arm, settings).K, slow.K, rtol=0.0)
 
 
@@ -259,8 +259,7 @@ def test_the_further_search_keeps_four_fifths_of_the_slowest_decay_and_half_of_t
 ):
     left = residuals(rough.task.nominal, np.zeros(1), rough.found.sampling, UNCERTAIN)
     after = AfterMotion(rough.search.slowest, [(0, one) for one in left])
-    monkeypatch.setattr(further, "FURTHER", (Further(0.9 * after(rough.x)[0], 800, 0.5),))
-    monkeypatch.setattr(further, "LESS", 0.0)
+    monkeypatch.setattr(further, "FURTHER", (Further(0.9 * after(rough.x)[0], 0.0, 800, 0.5),))
     asked = []
     taken = search_module.Search.sooner
     monkeypatch.setattr(
@@ -304,7 +303,7 @@ def test_margins_are_eased_only_where_motions_leave_very_much(
     wanted = FURTHER[chosen]
     assert eased == [wanted.eased if loop.kind == MARGIN else 1.0 for loop in rough.loops]
     assert budget == rough.task.settings.effort * wanted.evaluations
-    assert enough == LESS * wanted.much
+    assert enough == wanted.enough < wanted.much
     assert FURTHER[0].eased < FURTHER[1].eased == 1.0
 
 
@@ -400,7 +399,7 @@ def test_gains_that_let_a_mode_of_rubbing_joints_ring_longer_are_not_taken(
     rough, monkeypatch, before, now, taken
 ):
     x = rough.search.slowest.scaled(rough.found.K)
-    monkeypatch.setattr(further, "FURTHER", (Further(1e-3, 800, 0.5),))
+    monkeypatch.setattr(further, "FURTHER", (Further(1e-3, 0.0, 800, 0.5),))
     monkeypatch.setattr(search_module.Search, "sooner", lambda self, x, *_: 1.01 * x)
     monkeypatch.setattr(
         AfterMotion, "ringing", lambda self, y: before if np.array_equal(x, y) else now

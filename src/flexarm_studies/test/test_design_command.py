@@ -15,7 +15,7 @@ from flexarm_control.robust import design as design_module
 from flexarm_control.robust.recovery import Recovery
 from flexarm_control.robust.uncertain import Uncertainty
 from flexarm_dynamics.arm import arm_file
-from flexarm_studies.commands.design import _used, _yaml
+from flexarm_studies.commands.design import _left, _used, _yaml
 from flexarm_studies.loop import parameter_files, scenario
 from flexarm_studies.random_arms import generator
 
@@ -281,3 +281,10 @@ def test_the_card_names_the_joint_of_each_payload(used, words):
     found = SimpleNamespace(arm=arm_file.load("two_link"), uncertainty=uncertain)
     bears = SimpleNamespace(torque_used=None if used is None else np.array(used))
     assert _used(found, bears).startswith(words)
+
+
+def test_modes_that_no_torque_reaches_are_named_with_what_helps():
+    found = SimpleNamespace(left=(2.0 * np.pi * 3.5, 2.0 * np.pi * 22.04))
+    words = _left(found)
+    assert words.startswith("3.5 Hz, 22 Hz: no torque reaches these modes")
+    assert "at least three of their periods, or with shaper=zvd" in words

@@ -10,9 +10,8 @@ from .settling import AfterMotion, residuals
 #: The slowest pole of all loops keeps this part of the decay that was reached; where that is less than the second
 #: number, all of it [-].
 KEEP, LEAST = 0.8, 0.05
-#: The search ends where motions leave this part of what is much [-]. It takes fewer evaluations for more configurations
-#: than the second number.
-LESS, PLACES = 0.6, 3
+#: The search takes fewer evaluations for more configurations than these.
+PLACES = 3
 #: Its gains are not taken if, where joints rub, the slowest pole that rings loses more than this part of its decay, and
 #: then has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
 SHORTER, RINGS = 0.1, 0.03
@@ -22,12 +21,13 @@ class Further(NamedTuple):
     """A search for gains that leave less, and when it is made."""
 
     much: float  # J of `settling.AfterMotion` above which it is made, at full speed [-]
+    enough: float  # J at which it ends, at full speed [-]
     evaluations: int  # at most
     eased: float  # part of what was asked that loops are asked that are there for a margin [-]
 
 
 #: The first one that applies. Where motions leave very much, margins are paid for it.
-FURTHER = (Further(3.5, 800, 0.5), Further(2.0, 400, 1.0))
+FURTHER = (Further(3.5, 2.1, 800, 0.5), Further(2.0, 0.9, 400, 1.0))
 
 
 def leaving_less(task, found, progress):
@@ -76,7 +76,7 @@ def leaving_less(task, found, progress):
         after,
         _kept(reached),
         max(1, round(budget)),
-        LESS * chosen.much / task.speed,
+        chosen.enough / task.speed,
         lambda fraction: progress(fraction, found.decay),
     )
     if other is x or _rings_longer(after.ringing(other), after.ringing(x), task.speed):

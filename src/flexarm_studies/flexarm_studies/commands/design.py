@@ -310,11 +310,17 @@ def card_lines(found, bears):
         f"  torque limits       {_recovery(found)}",
     ]
     if found.left:
-        listed = ", ".join(f"{omega / (2.0 * np.pi):.3g} Hz" for omega in found.left)
-        lines.append(
-            f"  left to themselves  {listed}: no torque reaches these modes, or no gauge sees them"
-        )
+        lines.append(f"  left to themselves  {_left(found)}")
     return lines
+
+
+def _left(found):
+    """The modes that no control damps, and what helps, in words."""
+    listed = ", ".join(f"{omega / (2.0 * np.pi):.3g} Hz" for omega in found.left)
+    return (
+        f"{listed}: no torque reaches these modes, or no gauge sees them; motions of at least three of their periods,"
+        " or with shaper=zvd, excite them little"
+    )
 
 
 def _used(found, bears):
