@@ -150,7 +150,7 @@ ERRORS = [
         (
             "further",
             "after a motion: every design goes on",
-            "if leaves >= one.much / task.speed",
+            "if leaves >= one.much / speed",
             "if leaves >= 0.0",
         ),
         (
@@ -161,8 +161,8 @@ ERRORS = [
         ),
         (
             "design",
-            "after a motion: gains are taken with which the arm does not come back",
-            "if sooner.comes_back or not made.comes_back:",
+            "after a motion: gains are taken however much torque limits delay the arm",
+            "if not delayed(sooner.recovery, made.recovery):",
             "if True:",
         ),
         (

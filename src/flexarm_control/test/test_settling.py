@@ -279,26 +279,33 @@ def test_the_further_search_keeps_four_fifths_of_the_slowest_decay_and_half_of_t
 
 
 @pytest.mark.parametrize(
-    ("leaves", "speed", "chosen"),
-    [(3.6, 1.0, 0), (3.4, 1.0, 1), (2.1, 1.0, 1), (1.9, 1.0, None), (3.4, 0.5, None)],
+    ("leaves", "speed", "asked", "chosen"),
+    [
+        (3.6, 1.0, None, 0),
+        (3.4, 1.0, None, 1),
+        (2.1, 1.0, None, 1),
+        (1.9, 1.0, None, None),
+        (3.4, 0.5, None, None),
+        (3.4, 0.5, 1.0, 1),  # torque limits have lowered its speed
+    ],
 )
 def test_margins_are_eased_only_where_motions_leave_very_much(
-    rough, monkeypatch, leaves, speed, chosen
+    rough, monkeypatch, leaves, speed, asked, chosen
 ):
-    asked = []
+    searched = []
 
     def sooner(self, x, after, keep, budget, enough, progress):
-        asked.append((self.slowest.loops, budget, enough))
+        searched.append((self.slowest.loops, budget, enough))
         return x
 
     monkeypatch.setattr(search_module.Search, "sooner", sooner)
     monkeypatch.setattr(AfterMotion, "__call__", lambda self, x: (leaves, 0.0 * x))
     monkeypatch.setattr(rough.task, "speed", speed)
-    assert leaving_less(rough.task, rough.found, lambda fraction, decay: None) is None
+    assert leaving_less(rough.task, rough.found, lambda fraction, decay: None, asked) is None
     if chosen is None:
-        assert not asked
+        assert not searched
         return
-    ((loops, budget, enough),) = asked
+    ((loops, budget, enough),) = searched
     eased = [new.fraction / old.fraction for new, old in zip(loops, rough.loops, strict=True)]
     wanted = FURTHER[chosen]
     assert eased == [wanted.eased if loop.kind == MARGIN else 1.0 for loop in rough.loops]
@@ -309,18 +316,29 @@ def test_margins_are_eased_only_where_motions_leave_very_much(
 
 @pytest.mark.parametrize(
     ("before", "now", "taken"),
-    [(0.5, 0.6, True), (0.5, np.inf, False), (np.inf, np.inf, True), (np.inf, 0.5, True)],
+    [
+        ((1.5, 1.0), (1.6, 0.7), True),  # a delay of less than a period
+        ((2.0, 1.2), (2.1, 0.7), False),
+        ((2.2, 1.2), (2.1, 0.7), True),  # sooner all the same
+        ((1.5, 1.0), (np.inf, 0.7), False),
+        ((np.inf, 1.0), (np.inf, 0.7), True),
+        (None, (5.0, 0.7), True),
+        ((5.0, 1.0), None, True),
+    ],
 )
-def test_gains_that_leave_less_are_not_taken_where_they_alone_do_not_come_back(
+def test_gains_that_leave_less_are_not_taken_if_torque_limits_make_the_arm_later_with_them(
     monkeypatch, before, now, taken
 ):
-    """Times by which torque limits delay the arm, with the gains before and those of the further search."""
+    """Periods until settled with and without limits, of the gains before and of those of the further search."""
     arm, times, found = arm_file.load("R"), iter([before, now]), []
-    monkeypatch.setattr(
-        design_module, "recovery", lambda *_: Recovery(1.0 + (late := next(times)), 1.0, late)
-    )
 
-    def leaving(task, sets, progress):
+    def recovery(*_):
+        pair = next(times)
+        return None if pair is None else Recovery.of([pair])
+
+    monkeypatch.setattr(design_module, "recovery", recovery)
+
+    def leaving(task, sets, progress, asked):
         found.append(1.01 * sets.K)
         return sets._replace(K=found[0])
 

@@ -27,7 +27,7 @@ from ..feedforward.model import METHOD
 from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
-from .further import LEAST, leaving_less
+from .further import LEAST, delayed, leaving_less
 from .held import held_loops
 from .loop import ARM, STICKS, Sampling
 from .noise import Noise
@@ -465,15 +465,18 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
         begin = FIRST + (1.0 - FIRST) * k / len(SLOWER)
         now = say.part(begin, begin + (1.0 - FIRST) / len(SLOWER))
         # From starts of its own: gains that ask for much torque would stay so.
-        other = design_at(arm, slower, uncertainty, now)
+        other = design_at(arm, slower, uncertainty, now, asked=settings.speed)
         if other.holds and (other.comes_back or other.recovery.limited < found.recovery.limited):
             found = replace(other, slowed=True)
     say.part(0.0, 1.0)(1.0, found.decay)
     return found
 
 
-def design_at(arm, settings, uncertainty, progress=None, gains=None):
-    """A `Design` of the speed that is given, whether or not it comes back from the torque limits; see `design`."""
+def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None):
+    """A `Design` of the speed that is given, whether or not it comes back from the torque limits; see `design`.
+
+    `asked` is the speed from which torque limits have lowered it [-].
+    """
     task, say = Task(arm, settings, uncertainty), _Progress(progress)
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
@@ -489,10 +492,10 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None):
     made = task.design(found)
     if found.decay > 0.0 and task.nominal.n_modes:
         edged = Task(arm, settings, replace(uncertainty, edges=True), task.short)
-        other = leaving_less(edged, found, say.part(NEARBY, 1.0))
+        other = leaving_less(edged, found, say.part(NEARBY, 1.0), asked)
         if other is not None:
             sooner = edged.design(other)
-            if sooner.comes_back or not made.comes_back:
+            if not delayed(sooner.recovery, made.recovery):
                 made = sooner
     say.part(0.0, 1.0)(1.0, made.decay)
     return made

@@ -15,13 +15,16 @@ PLACES = 3
 #: Its gains are not taken if, where joints rub, the slowest pole that rings loses more than this part of its decay, and
 #: then has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
 SHORTER, RINGS = 0.1, 0.03
+#: Nor are they taken if the torque limits delay the arm by more locked periods than this, so that it settles later than
+#: before.
+DELAYED = 1.0
 
 
 class Further(NamedTuple):
     """A search for gains that leave less, and when it is made."""
 
-    much: float  # J of `settling.AfterMotion` above which it is made, at full speed [-]
-    enough: float  # J at which it ends, at full speed [-]
+    much: float  # J of `settling.AfterMotion` above which it is made, if full speed was asked [-]
+    enough: float  # J at which it ends, likewise [-]
     evaluations: int  # at most
     eased: float  # part of what was asked that loops are asked that are there for a margin [-]
 
@@ -30,7 +33,7 @@ class Further(NamedTuple):
 FURTHER = (Further(3.5, 2.1, 800, 0.5), Further(2.0, 0.9, 400, 1.0))
 
 
-def leaving_less(task, found, progress):
+def leaving_less(task, found, progress, speed=None):
     """Gains near those that were found with which motions leave less behind, where these leave much.
 
     Parameters
@@ -40,6 +43,8 @@ def leaving_less(task, found, progress):
         They hold.
     progress : callable
         Called with a fraction of the work, and the decay that was found.
+    speed : float, optional
+        That was asked, from which the task's may have been lowered; the task's if not given [-].
 
     Returns
     -------
@@ -57,8 +62,8 @@ def leaving_less(task, found, progress):
     decays = whole.decays(x)
     if not left or min(decays) <= 0.0:
         return None
-    leaves = after(x)[0]
-    chosen = next((one for one in FURTHER if leaves >= one.much / task.speed), None)
+    leaves, speed = after(x)[0], speed or task.speed
+    chosen = next((one for one in FURTHER if leaves >= one.much / speed), None)
     if chosen is None:
         return None
     eased = [
@@ -76,13 +81,20 @@ def leaving_less(task, found, progress):
         after,
         _kept(reached),
         max(1, round(budget)),
-        chosen.enough / task.speed,
+        chosen.enough / speed,
         lambda fraction: progress(fraction, found.decay),
     )
     if other is x or _rings_longer(after.ringing(other), after.ringing(x), task.speed):
         return None
     used = found.evaluations + whole.evaluations + search.evaluations
     return task.sets(whole, other, used)
+
+
+def delayed(now, before):
+    """Whether the torque limits are a reason not to take gains, by each `Recovery` with and without them."""
+    if now is None or before is None:
+        return False
+    return now.later > DELAYED and now.limited > before.limited
 
 
 def _kept(reached):
