@@ -49,9 +49,8 @@ class Client:
 
         def answered():
             nonlocal again
-            if (
-                time.monotonic() > again
-            ):  # a server that has not found the client yet drops its answer; a busy one takes seconds
+            # A server that has not found the client yet drops its answer; a busy one takes seconds.
+            if time.monotonic() > again:
                 again = time.monotonic() + 10.0
                 futures.append(
                     self.client.send_goal_async(
