@@ -123,14 +123,20 @@ ERRORS = [
         (
             "channels",
             "light joints: no mode more than the arm file has",
-            "fuller = model.fuller(model.arm.most_modes + 1)",
-            "fuller = model",
+            "model.fuller(model.arm.most_modes + 1)",
+            "model",
         ),
         (
             "channels",
             "amplitudes as gauges show them: only the modes of the file",
-            "np.maximum(bends, _largest([strain_map.inverse @ e for e in felt]), out=bends)",
+            "bends = np.maximum(bends, _largest([shown @ each for _, each in means]))",
             "pass",
+        ),
+        (
+            "channels",
+            "strains with a mode more: without the gauges' gains",
+            "np.array([[g.gain] for g in gauges]) * gauge_rows",
+            "gauge_rows",
         ),
     ),
 ]

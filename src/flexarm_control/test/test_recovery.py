@@ -245,11 +245,13 @@ def test_a_design_that_does_not_come_back_is_made_slower_until_one_does(monkeypa
         monkeypatch,
         lambda speed: Recovery.of([(9.0 if speed > 0.4 else 8.5, 1.0 if speed > 0.4 else 8.0)]),
     )
-    reported = []
+    reported, searched = [], []
+    monkeypatch.setattr(design_module, "leaving_less", lambda *task: searched.append(task[3]))
     found = design(
         arm_file.load("R"), replace(QUICK, speed=0.8), progress=lambda f, d: reported.append(f)
     )
     assert list(dict.fromkeys(asked)) == [0.8, 0.8 * SLOWER[0], 0.8 * SLOWER[1]]
+    assert searched == [None, 0.8, 0.8]  # the speed that was asked
     assert found.settings.speed == 0.8 * SLOWER[1] == 0.4
     assert found.recovery == Recovery(8.5, 8.0, 0.5) and found.slowed
     assert reported[-1] == 1.0 and max(reported[:-1]) >= 0.8

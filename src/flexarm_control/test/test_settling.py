@@ -322,6 +322,7 @@ def test_margins_are_eased_only_where_motions_leave_very_much(
         ((2.2, 1.2), (2.1, 0.7), True),  # sooner all the same
         ((1.5, 1.0), (np.inf, 0.7), False),
         ((np.inf, 1.0), (np.inf, 0.7), True),
+        ((5.0, 4.0), (4.9, 2.5), False),  # it came back before
         (None, (5.0, 0.7), True),
         ((5.0, 1.0), None, True),
     ],

@@ -152,10 +152,10 @@ class Report:
             return WARN, f"torque at its limit in {saturated} of {rate} samples"
         if core.reason:
             return WARN, core.reason
-        if self._design is not None and not self._design.comes_back:
-            return WARN, SWINGS
         if not core.fast_enabled:
             return WARN, "the fast control is off: call ~/enable_fast with data true"
+        if self._design is not None and not self._design.comes_back:
+            return WARN, SWINGS
         return OK, ""
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 from .loop import ARM, MARGIN
 from .settling import AfterMotion, residuals
 
-#: The slowest pole of all loops keeps this part of the decay that was reached; where that is less than the second
-#: number, all of it [-].
+#: The slowest pole of all loops keeps this part of the decay that was reached, and no less than the second number. If
+#: it had less than that, it keeps all of it [-].
 KEEP, LEAST = 0.8, 0.05
 #: The search takes fewer evaluations for more configurations than these.
 PLACES = 3
@@ -16,7 +16,7 @@ PLACES = 3
 #: then has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
 SHORTER, RINGS = 0.1, 0.03
 #: Nor are they taken if the torque limits delay the arm by more locked periods than this, so that it settles later than
-#: before.
+#: before, or if it came back from them before and does not now.
 DELAYED = 1.0
 
 
@@ -91,10 +91,11 @@ def leaving_less(task, found, progress, speed=None):
 
 
 def delayed(now, before):
-    """Whether the torque limits are a reason not to take gains, by each `Recovery` with and without them."""
+    """Whether the torque limits are a reason not to take gains, by the `Recovery` with these and with those before."""
     if now is None or before is None:
         return False
-    return now.later > DELAYED and now.limited > before.limited
+    lost = before.comes_back and not now.comes_back
+    return lost or (now.later > DELAYED and now.limited > before.limited)
 
 
 def _kept(reached):

@@ -10,14 +10,16 @@ strain map, a step :math:`\Delta u` of the torque changes the accelerations by
 
 where the 2 allows for errors of the model. The end of a light link has hardly any inertia of its own, so that a motor
 on it turns back by modes that the arm file leaves out. Gauges feel these modes, too. So for an arm with a light joint
-each bound is also computed with a mode more, with the mean acceleration that a constant torque causes over a time t
-instead of H:
+the bounds of what joints and gauges show are also computed with one mode more in every direction, and with the mean
+acceleration that a constant torque causes over a time t instead of H:
 
 .. math:: \bar H = \begin{pmatrix} M_{11}^{-1} & 0 \\ 0 & 0 \end{pmatrix}
-          + \sum_k \left(\frac{\sin(\omega_k t/2)}{\omega_k t/2}\right)^2 \phi_k\phi_k^T ,
+          + \sum_k s_k^2\,\phi_k\phi_k^T , \qquad s_k = \frac{\sin(\omega_k t/2)}{\omega_k t/2}
 
-with the normal modes :math:`\phi_k` of unit modal mass and their frequencies :math:`\omega_k`. The larger bound holds.
-Without the average the sum would grow with each mode; with it, it converges.
+with the normal modes :math:`\phi_k` of unit modal mass and their frequencies :math:`\omega_k`. So positions move by
+:math:`\tfrac12 t^2\bar H\Delta u` in the time t. Velocities change in half of that time by
+:math:`\tfrac12 t\bar H\Delta u` with s_k instead of its square. The larger bound holds. Without the average the sum
+would grow with each mode; with it, it converges. The time t is for up to 1000 samples per second.
 
 Everything else that acts (pushes, gravity, brakes) is assumed to change the joints' accelerations by at most
 :math:`2|M_{11}^{-1}|u_{max}`, with the torque limit or the brake's torque, whichever is larger. The accelerations of
@@ -74,7 +76,8 @@ class Channels:
     count : ndarray, shape (n,)
         Steps of the encoders; zero where the arm file states none [rad].
     gain : ndarray, shape (N, n)
-        Change of acceleration per torque, in magnitude, `MARGIN` times the largest over the configurations.
+        Change of acceleration per torque, in magnitude, `MARGIN` times the largest over the configurations, of the
+        model and, with a light joint, of the mean with a mode more.
     push : ndarray, shape (N,)
         Change of acceleration by causes that are not reported; infinite if a joint has no torque limit.
     heavy : bool
@@ -148,16 +151,20 @@ class Channels:
             soft = [0.05 * part @ strength for part in (strains, bends)]
             hard = 2.0 * _largest(rigid) @ strength
             push = np.concatenate([hard, *soft, hard, soft[1]])
+        speeds, rates = joints, bends
         if not self.heavy:
-            fuller = model.fuller(model.arm.most_modes + 1)
+            fuller, gauges = model.fuller(model.arm.most_modes + 1), model.arm.gauges
             means = [mean_accelerations(fuller, q, AVERAGED) for q in places]
-            np.maximum(joints, _largest([each for each, _ in means]), out=joints)
+            begun = [mean_accelerations(fuller, q, AVERAGED, of_velocity=True) for q in places]
+            speeds = np.maximum(joints, _largest([each for each, _ in begun]))
+            joints = np.maximum(joints, _largest([each for each, _ in means]))
             if strain_map is not None:
-                rows = gauge_rows(fuller, model.arm.gauges)
-                felt = [rows @ each for _, each in means]
-                np.maximum(strains, _largest(felt), out=strains)
-                np.maximum(bends, _largest([strain_map.inverse @ e for e in felt]), out=bends)
-        return MARGIN * np.vstack([joints, strains, bends, joints, bends]), push
+                rows = np.array([[g.gain] for g in gauges]) * gauge_rows(fuller, gauges)
+                strains = np.maximum(strains, _largest([rows @ each for _, each in means]))
+                shown = strain_map.inverse @ rows
+                rates = np.maximum(bends, _largest([shown @ each for _, each in begun]))
+                bends = np.maximum(bends, _largest([shown @ each for _, each in means]))
+        return MARGIN * np.vstack([joints, strains, bends, speeds, rates]), push
 
     def read(self, sample, out, raw):
         """Read an `ArmSample` into `out`, shape (N,), and its (q, strain, qd) into `raw`, (2 n + g,)."""
@@ -177,7 +184,7 @@ def _largest(arrays):
     return np.abs(arrays).max(axis=0)
 
 
-def mean_accelerations(model, q, time):
+def mean_accelerations(model, q, time, of_velocity=False):
     """Mean accelerations after a step of the torques, per torque: the two blocks of the module's H, averaged.
 
     Parameters
@@ -187,7 +194,9 @@ def mean_accelerations(model, q, time):
     q : ndarray, shape (n,)
         Joint angles [rad].
     time : float
-        Over which they are averaged: a motion from rest covers half of them times the time's square [s].
+        A motion from rest covers half of them times this time's square [s].
+    of_velocity : bool
+        The mean over half of the time, for what the velocities then are.
 
     Returns
     -------
@@ -198,7 +207,7 @@ def mean_accelerations(model, q, time):
     """
     n = model.n_joints
     omega, shapes = model.normal_modes(q)
-    weighted = shapes * np.sinc(omega * time / (2.0 * np.pi)) ** 2
+    weighted = shapes * np.sinc(omega * time / (2.0 * np.pi)) ** (1 if of_velocity else 2)
     both = weighted @ shapes[:n].T
     both[:n] += np.linalg.inv(model.terms(q, np.zeros(n)).M[:n, :n])
     return both[:n], both[n:]
