@@ -473,9 +473,18 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
 
 
 def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None):
-    """A `Design` of the speed that is given, whether or not it comes back from the torque limits; see `design`.
+    """A `Design` of the speed that is given, whether or not it comes back from the torque limits.
 
-    `asked` is the speed from which torque limits have lowered it [-].
+    Parameters
+    ----------
+    arm, settings, uncertainty, progress, gains
+        As of `design`.
+    asked : float, optional
+        The speed that was asked, from which torque limits have lowered that of the settings [-].
+
+    Returns
+    -------
+    Design
     """
     task, say = Task(arm, settings, uncertainty), _Progress(progress)
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
