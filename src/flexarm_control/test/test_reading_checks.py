@@ -268,6 +268,29 @@ def test_strains_that_are_too_large_are_no_exchanged_gauges():
     assert wirings_of_a_swing(arm, larger) == {None}
 
 
+def test_gauges_that_agree_with_each_other_would_not_if_they_were_exchanged():
+    """Of a link with one mode, however well the exchanged readings' amplitude fits the motion."""
+    text = arm_file.find("R").read_text().replace("modes: 2", "modes: 1")
+    m = models.build(arm_file.parse(text))
+    map_ = StrainMap(m)
+    law, rows = StrainLaw(Channels(m, map_), map_, 0.3), map_.rows[:, 0]
+    law.update(np.zeros(1), np.zeros(2), np.zeros(1), PERIOD, np.zeros(2))
+    exchanged = next(h[2] for h in law.hypotheses if "exchanged" in h[0])
+    still = np.zeros((3, len(law.hypotheses), 4, 2))
+
+    def misfit(read):
+        """Misfit of all hypotheses, whose readings at rest are `read`, to a motion that asks just their amplitude."""
+        still[0] = read
+        return law._fit(still, -np.tile(law._project @ read, (4, 1)))
+
+    assert misfit(rows) == pytest.approx(0.0, abs=1e-20)
+    swapped = exchanged @ rows
+    alone = swapped - law._project @ swapped
+    wanted = alone @ alone / (2.0 * ((law._project @ swapped) ** 2).sum())
+    assert misfit(swapped) == pytest.approx(wanted)
+    assert wanted > 0.1
+
+
 def wirings_of_a_swing(arm, read):
     """What is found while an arm with one mode swings; `read` makes the readings of an amplitude from its strains."""
     m = models.build(arm)

@@ -26,7 +26,8 @@ A wiring T may have begun only a moment ago. The low pass is linear. So from the
 `ONSETS` moments, `EVERY` apart, that move on with time, so that the filter's memory of right strains does not delay
 the result. If an offset of a single gauge explains the misfit as well, it is left to `zero_drift`. If a positive factor
 of all strains explains it as well, it is no wiring: play and a wrong payload cause such a factor, and so do exchanged
-gauges of a link with one mode.
+gauges of a link with one mode. So the misfit of a hypothesis also has the square of what no modes of the link explain
+of its strains, :math:`\varepsilon - RW\varepsilon`: gauges that agree with each other are not exchanged.
 
 A hypothesis is not accepted if its strains are small compared with what a free oscillation moves. The readings of
 exchanged gauges do not show this, so it is judged with the strains of the hypothesis. Arms with light joints
@@ -279,7 +280,8 @@ class StrainLaw:
         """Misfit of each hypothesis' strains and derivatives, (3, h, kept, g); infinite where inertias cancel."""
         parts = self._explained(read)
         z, moved = parts.sum(axis=0), parts[1:].sum(axis=0)
-        parts = (z + p) ** 2, z * z + p * p, read[0] ** 2, moved**2
+        alone = read[0] - parts[0]  # what no modes explain of what the gauges of a link show together
+        parts = (z + p) ** 2 + alone**2, z * z + p * p, read[0] ** 2, moved**2
         misfit, total, still, swing = (
             (self._concerned * part.mean(axis=1)).sum(axis=1) for part in parts
         )
