@@ -274,4 +274,15 @@ ERRORS = [
             "        if np.isfinite(error):\n",
         ),
     ),
+    *of(
+        "flexarm_dynamics",
+        "arm",
+        "flexarm_dynamics/test/test_strain_map.py",
+        (
+            "strain_map",
+            "readings: without the gauges' gains",
+            "return gains[:, None] * gauge_rows",
+            "return gauge_rows",
+        ),
+    ),
 ]

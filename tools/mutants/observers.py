@@ -132,11 +132,5 @@ ERRORS = [
             "bends = np.maximum(bends, _largest([shown @ each for _, each in means]))",
             "pass",
         ),
-        (
-            "channels",
-            "strains with a mode more: without the gauges' gains",
-            "np.array([[g.gain] for g in gauges]) * gauge_rows",
-            "gauge_rows",
-        ),
     ),
 ]

@@ -12,7 +12,7 @@ if the arm file states them; noise and drift only on request.
 
 import numpy as np
 
-from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.arm.strain_map import reading_rows
 
 
 class Sensors:
@@ -32,9 +32,7 @@ class Sensors:
 
     def __init__(self, model, noise=False, seed=0, period=0.0):
         arm = model.arm
-        self.rows = gauge_rows(model, arm.gauges) * np.array(
-            [[g.gain] for g in arm.gauges] or [[1.0]]
-        )
+        self.rows = reading_rows(model, arm.gauges)
         self.bias = np.array([g.bias for g in arm.gauges])
         self.sigma = np.array([g.noise if noise else 0.0 for g in arm.gauges])
         #: Rms change of the bias from one reading to the next, shape (gauges,) [-].

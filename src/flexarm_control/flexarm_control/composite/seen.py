@@ -18,7 +18,7 @@ A feed-forward may know more modes than the observer (`feedforward_modes`). The 
 
 import numpy as np
 
-from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.arm.strain_map import StrainMap, reading_rows
 
 from .. import kernels
 
@@ -32,8 +32,7 @@ def shown(model, fuller):
     if len(arm.gauges) < model.n_modes or arm.observed_modes != model.mode_names:
         names = np.array(fuller.mode_names, object)
         return (np.array(model.mode_names, object)[:, None] == names).astype(float)
-    gains = np.array([gauge.gain for gauge in arm.gauges])
-    return StrainMap(model).inverse @ (gains[:, None] * gauge_rows(fuller, arm.gauges))
+    return StrainMap(model).inverse @ reading_rows(fuller, arm.gauges)
 
 
 class SeenMotion:

@@ -31,7 +31,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.arm.strain_map import StrainMap, reading_rows
 from flexarm_dynamics.errors import MessageError, ModelError, ParameterError
 from flexarm_dynamics.linear import jacobian
 from flexarm_dynamics.parameters import parameter
@@ -113,11 +113,10 @@ class MotionKalman(Kalman):
         size = self.motion.size
         self._bias = slice(2 * p + n, 2 * p + n + g)
         self._map = StrainMap(model)
-        gains = np.array([gauge.gain for gauge in arm.gauges])
         self._stated = np.array([gauge.bias for gauge in arm.gauges])
         self._C = np.zeros((n + g, size))
         self._C[:n, :n] = np.eye(n)
-        self._C[n:, n:p] = gains[:, None] * gauge_rows(model, arm.gauges)
+        self._C[n:, n:p] = reading_rows(model, arm.gauges)
         self._C[n:, self._bias] = np.eye(g)
         self._C[n:, self._bias.stop] = self._shared = np.array(values["common_noise"], float)
         noise = [

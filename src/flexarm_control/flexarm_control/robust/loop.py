@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexarm_dynamics.arm.encoders import encoder_rows
-from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.arm.strain_map import StrainMap, reading_rows
 from flexarm_dynamics.linear import linear_plant, sampled
 
 from ..low_pass import POLES, LowPass
@@ -74,8 +74,7 @@ class Loop:
 def measured_amplitudes(nominal, plant):
     """Amplitudes that the file's strain map gives for the plant's deflections, shape (m, m of the plant)."""
     map_ = StrainMap(nominal)
-    gains = np.array([g.gain for g in nominal.arm.gauges])
-    return map_.inverse @ (gains[:, None] * gauge_rows(plant, nominal.arm.gauges))
+    return map_.inverse @ reading_rows(plant, nominal.arm.gauges)
 
 
 def sampled_loop(

@@ -57,6 +57,12 @@ def gauge_rows(model, gauges, mode_names=None):
     return rows
 
 
+def reading_rows(model, gauges, mode_names=None):
+    """As `gauge_rows`, times the gain of each gauge: what the gauges read, biases aside."""
+    gains = np.array([gauge.gain for gauge in gauges], float)
+    return gains[:, None] * gauge_rows(model, gauges, mode_names)
+
+
 def reading_noise(gauges):
     """Rms error of each gauge's reading for the weights, shape (gauges,) [strain], and whether any gauge states it.
 
@@ -141,8 +147,7 @@ class StrainMap:
                 value=len(arm.gauges),
                 hint="add gauges or list fewer observed_modes",
             )
-        gains = np.array([g.gain for g in arm.gauges])
-        self.rows = gains[:, None] * gauge_rows(model, arm.gauges, self.mode_names)
+        self.rows = reading_rows(model, arm.gauges, self.mode_names)
         self.noise, self.noise_stated = reading_noise(arm.gauges)
         weighted = self._weighted = self.rows / self.noise[:, None]
         self.condition = float(np.linalg.cond(weighted)) if weighted.size else 1.0

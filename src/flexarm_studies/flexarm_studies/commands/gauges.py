@@ -24,7 +24,13 @@ import numpy as np
 from flexarm_control.observers.gauge_health import resolution
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import REDUCED, Gauge
-from flexarm_dynamics.arm.strain_map import StrainMap, confused, gauge_rows, reading_noise
+from flexarm_dynamics.arm.strain_map import (
+    StrainMap,
+    confused,
+    gauge_rows,
+    reading_noise,
+    reading_rows,
+)
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 
@@ -162,8 +168,7 @@ def _typical(present):
 def _weighted(arm_model, names, present):
     noise, stated = reading_noise(present)
     noise = noise if stated else ASSUMED_NOISE * noise
-    gains = np.array([g.gain for g in present])
-    return gains[:, None] * gauge_rows(arm_model, present, names) / noise[:, None]
+    return reading_rows(arm_model, present, names) / noise[:, None]
 
 
 def _present(arm_model, names, present):

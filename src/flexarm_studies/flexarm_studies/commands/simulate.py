@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.arm.strain_map import reading_rows
 from flexarm_dynamics.errors import FlexarmError, ModelError
 from flexarm_dynamics.models import levels, model
 from flexarm_sim.integrators import METHODS, friction_warning, plant_substeps, substeps
@@ -182,8 +182,7 @@ def _motion(options, arm, reader):
 def _strains(chain):
     """Function from modal amplitudes (m,) to the gauges' readings (g,), without noise."""
     gauges = chain.arm.gauges
-    gains = np.array([g.gain for g in gauges])
-    rows = gains[:, None] * gauge_rows(chain, gauges)
+    rows = reading_rows(chain, gauges)
     bias = np.array([g.bias for g in gauges])
     return lambda delta: rows @ delta + bias
 

@@ -12,7 +12,7 @@ included. The initial state x_0 is unknown and estimated with the parameters.
 
 import numpy as np
 
-from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.arm.strain_map import reading_rows
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.models.chain import Chain
@@ -74,11 +74,10 @@ class Predictor:
         if built is None:
             return out
         out[:, : self.n] = states[:, : self.n]
-        gains = np.array([g.gain for g in arm.gauges])
         bias = np.array([g.bias for g in arm.gauges])
         if count:
             delta = states[:, self.n : self.n + self.m]
-            out[:, self.n :] = delta @ (gains[:, None] * gauge_rows(built, arm.gauges)).T + bias
+            out[:, self.n :] = delta @ reading_rows(built, arm.gauges).T + bias
         return out
 
     def predict(self, arm, initial, samples=None):
@@ -94,9 +93,8 @@ class Predictor:
         state[n + m : 2 * n + m] = np.polyfit(r.time[:few], r.position[:few], 1)[0]
         ok = np.isfinite(r.strain[0])
         if m and ok.any():
-            gains = np.array([g.gain for g in arm.gauges])[ok]
             bias = np.array([g.bias for g in arm.gauges])[ok]
-            rows = gains[:, None] * gauge_rows(built, arm.gauges)[ok]
+            rows = reading_rows(built, arm.gauges)[ok]
             state[n : n + m] = np.linalg.lstsq(rows, r.strain[0][ok] - bias, rcond=None)[0]
         elif m:
             state[n : n + m] = built.static_deflection(r.position[0])

@@ -18,7 +18,7 @@ Between samples, :math:`\delta` is the Hermite cubic of amplitudes and rates.
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.arm.strain_map import reading_rows
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.kernels.chain_data import ENGAGEMENT
 from flexarm_dynamics.models import fixed_step, model
@@ -139,7 +139,7 @@ class MotionPredictor:
         out = np.full((len(delta), len(gauges)), np.nan)
         if built is None:
             return out
-        rows = np.array([g.gain for g in gauges])[:, None] * gauge_rows(built, gauges)
+        rows = reading_rows(built, gauges)
         late = np.zeros(len(gauges)) if delay is None else np.asarray(delay, float)
         for c in range(len(gauges)):
             read, slope = delta @ rows[c], rate @ rows[c]

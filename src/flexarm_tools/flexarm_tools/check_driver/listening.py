@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.arm.strain_map import reading_rows
 from flexarm_dynamics.shown import show
 
 from .samples import Finding, Verdict
@@ -329,7 +329,7 @@ def check_strain_at_rest(model, samples):
             return Finding("strain at rest", FAIL, text)
     if np.ptp(samples.position, axis=0).max() > REST:
         return Finding("strain at rest", SKIPPED, "the arm is not at rest")
-    rows = gauge_rows(model, gauges) * np.array([[g.gain] for g in gauges])
+    rows = reading_rows(model, gauges)
     bias = np.array([g.bias for g in gauges])
     expected = rows @ model.static_deflection(samples.position.mean(axis=0)) + bias
     off = np.abs(samples.strain.mean(axis=0) - expected) / [g.full_scale for g in gauges]

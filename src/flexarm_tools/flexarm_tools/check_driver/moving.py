@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows
+from flexarm_dynamics.arm.strain_map import StrainMap, reading_rows
 from flexarm_dynamics.singular_perturbation import fast_subsystem, slow_subsystem
 from flexarm_sim.plant import Plant
 
@@ -320,7 +320,7 @@ def check_modes(model, samples, deflection, gain_error):
 def _strains(model, deflection):
     """Strains of the model without biases, shape (N, gauges)."""
     gauges = model.arm.gauges
-    return deflection @ (gauge_rows(model, gauges) * np.array([[g.gain] for g in gauges])).T
+    return deflection @ reading_rows(model, gauges).T
 
 
 def _signals(name, what, names, measured, expected, least, gain_error):

@@ -30,7 +30,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from flexarm_dynamics.arm.strain_map import gauge_rows
+from flexarm_dynamics.arm.strain_map import reading_rows
 
 from ... import kernels
 
@@ -159,7 +159,7 @@ class Channels:
             speeds = np.maximum(joints, _largest([each for each, _ in begun]))
             joints = np.maximum(joints, _largest([each for each, _ in means]))
             if strain_map is not None:
-                rows = np.array([[g.gain] for g in gauges]) * gauge_rows(fuller, gauges)
+                rows = reading_rows(fuller, gauges)
                 strains = np.maximum(strains, _largest([rows @ each for _, each in means]))
                 shown = strain_map.inverse @ rows
                 rates = np.maximum(bends, _largest([shown @ each for _, each in begun]))

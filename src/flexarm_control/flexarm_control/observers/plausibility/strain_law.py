@@ -280,7 +280,8 @@ class StrainLaw:
         """Misfit of each hypothesis' strains and derivatives, (3, h, kept, g); infinite where inertias cancel."""
         parts = self._explained(read)
         z, moved = parts.sum(axis=0), parts[1:].sum(axis=0)
-        alone = read[0] - parts[0]  # what no modes explain of what the gauges of a link show together
+        # What no modes of a link explain of what its gauges show together.
+        alone = read[0] - parts[0]
         parts = (z + p) ** 2 + alone**2, z * z + p * p, read[0] ** 2, moved**2
         misfit, total, still, swing = (
             (self._concerned * part.mean(axis=1)).sum(axis=1) for part in parts
