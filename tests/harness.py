@@ -186,6 +186,11 @@ class Arm:
     joints : sequence of str
     pauses_at : int, optional
         The sample at which the simulator pauses by itself.
+
+    Attributes
+    ----------
+    trajectories : str
+        Topic of the controller's trajectories.
     """
 
     #: Type of the service ~/reset.
@@ -193,7 +198,7 @@ class Arm:
 
     def __init__(self, bench, namespace="", joints=("joint1",), pauses_at=None):
         self.bench, self.namespace, self.joints = bench, namespace, list(joints)
-        self.pauses_at = pauses_at
+        self.pauses_at, self.trajectories = pauses_at, f"{namespace}joint_trajectory"
         self.measured = bench.tap(ArmState, f"{namespace}arm_state")
         self.estimated = bench.tap(ArmState, f"{namespace}arm_state_estimate")
         self.torques = bench.tap(JointTorque, f"{namespace}joint_torque")
@@ -280,9 +285,8 @@ class Arm:
         return self.bench.call(Trigger, f"{self.namespace}controller/recover").success
 
     def publish_trajectory(self, message):
-        """Publish on joint_trajectory, once."""
-        publisher = self.bench.publisher(JointTrajectory, f"{self.namespace}joint_trajectory")
-        publisher.publish(message)
+        """Publish a trajectory, once."""
+        self.bench.publisher(JointTrajectory, self.trajectories).publish(message)
 
     def offer(self, message):
         """Publish a trajectory, once a second, until it is accepted; its number.

@@ -591,7 +591,8 @@ def test_when_the_observer_is_killed_the_controller_disables_after_state_timeout
     in_motion(real_time)
     bench.kill("observer")
     bench.wait_for("DISABLED", lambda: real_time.torques.newest.mode == JointTorque.DISABLED)
-    assert f"no arm_state_estimate for {TIMEOUT:g} s" in bench.log("controller")
+    text = f"no arm_state_estimate for {TIMEOUT:g} s"
+    bench.wait_for("the reason in the log", lambda: text in bench.log("controller"))
     since = len(bench.diagnostics("controller"))
     bench.wait_for(
         "an error on /diagnostics",

@@ -11,7 +11,6 @@ import pytest
 from harness import PATIENT, SHM, Arm, Bench, Drive, Source, abandoned, segments, trajectory
 from in_process import InProcess
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectory
 
 from flexarm_control.composite.design import FAST, SLOW, design_law
 from flexarm_control.nodes.controller import ControllerNode
@@ -706,10 +705,8 @@ def test_two_arms_side_by_side_one_killed_the_other_unaffected_topics_remapped(b
     assert right.measured.newest is None
 
     goal = trajectory(["joint1"], (1.0, [0.2], [0.0], [0.0]))
-    bench.publisher(JointTrajectory, "/goal").publish(goal)
-    bench.wait_for(
-        "the right arm to move", lambda: right.state.supervisor_state == CompositeState.TRACKING
-    )
+    right.trajectories = "/goal"
+    right.offer(goal)
     bench.kill("left_controller")
     bench.wait_for(
         "the right arm at its goal",

@@ -90,8 +90,16 @@ ERRORS = [
     *of(
         "flexarm_control",
         "kernels",
-        TESTS + "test_robust.py",
-        ("eigenvectors", "the gradient's sign", "by_torque /= -period", "by_torque /= period"),
+        TESTS + "test_pole_kernels.py",
+        ("poles", "the gradient's sign", "by_torque /= -period", "by_torque /= period"),
+        (
+            "poles",
+            "half of a reflector",
+            "x[i] -= along * H[k, i]",
+            "x[i] -= 0.5 * along * H[k, i]",
+        ),
+        ("poles", "poles in the order of LAPACK", "v[k, i - 1] < value", "v[k, i - 1] < -np.inf"),
+        ("poles", "growing poles are asked little", "if s.real >= 0.0:", "if s.real >= 1e9:"),
     ),
     *of(
         "flexarm_control",

@@ -61,9 +61,23 @@ ERRORS = [
         (
             "decay",
             "every set has all of the gradient",
-            "np.outer(self._weights[id(loop)], slope)",
-            "np.outer(np.ones(len(self._weights[id(loop)])), slope)",
+            "(self._of(loops).T @ slopes)",
+            "(np.ones_like(self._of(loops)).T @ slopes)",
             TESTS + "test_schedule.py",
+        ),
+        (
+            "threads",
+            "the first part is left out",
+            "_run(parts[0])",
+            "pass",
+            TESTS + "test_pole_kernels.py",
+        ),
+        (
+            "decay",
+            "poles that no gain moves count",
+            "v[(v < least) | ((v <= GROWS) & (lengths <= UNMOVED))] = -np.inf",
+            "v[v < least] = -np.inf",
+            TESTS + "test_pole_kernels.py",
         ),
         ("search", "the worst loops are not chosen", "if value > most and", "if value < most and"),
         (

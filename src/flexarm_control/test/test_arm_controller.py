@@ -664,6 +664,18 @@ def test_another_driver_that_confirms_no_controller_may_follow_one_that_does(arm
         assert core.step(sample(k, stamp_ns=stamp(60 + k), session=2)) is True
 
 
+@pytest.mark.parametrize("first", [{}, {"velocity_known": False}])
+def test_a_driver_that_came_during_a_fault_may_take_its_time_to_confirm(arm_r, first):
+    core = started(arm_r)
+    core.controller_id = 7
+    assert all(applying(core, range(1, 50), controller_id=7))
+    core.fail("no arm_state_estimate for 1 s")
+    core.step(sample(0, stamp_ns=stamp(60), session=2, **first))
+    core.recover()
+    for k in range(1, 500):
+        assert core.step(sample(k, stamp_ns=stamp(60 + k), session=2)) is True
+
+
 def test_while_a_sensor_is_in_doubt_no_motion_is_accepted(arm_r):
     core = started(arm_r)
     core.step(sample(1, trust=ArmSample.STOP, doubt="strain of root: lost"))

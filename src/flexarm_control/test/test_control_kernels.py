@@ -44,7 +44,8 @@ def test_between_rows_values_are_linear_and_the_last_one_is_held(x):
 
 def test_responses_of_the_bending_are_those_of_scipys_integrator():
     m, n, count, steps, T = 2, 2, 3, 200, 1.3
-    spring, damper, by = -40.0 * np.eye(m), -0.3 * np.eye(m), RNG.normal(size=(m, 3, n))
+    by = np.random.default_rng(2).normal(size=(m, 3, n))  # whatever other tests have drawn
+    spring, damper = -40.0 * np.eye(m), -0.3 * np.eye(m)
     spring[0, 1] = 7.0
     shift = [lambda t, k=k: np.sin((k + 1.0) * t) for k in range(count)]
     shift_d = [lambda t, k=k: (k + 1.0) * np.cos((k + 1.0) * t) for k in range(count)]
@@ -65,13 +66,20 @@ def test_responses_of_the_bending_are_those_of_scipys_integrator():
                 return np.concatenate([s[m:], spring @ s[:m] + damper @ s[m:] + force])
 
             wanted = solve_ivp(
-                rates, (0.0, T), np.zeros(2 * m), rtol=1e-10, atol=1e-12, dense_output=True
+                rates,
+                (0.0, T),
+                np.zeros(2 * m),
+                "DOP853",
+                dense_output=True,
+                rtol=1e-10,
+                atol=1e-12,
             )
             for row, step in enumerate(rows):
                 t = step * T / steps
                 state = wanted.sol(t)
                 found = out[row, :, :, joint * count + k].ravel()
-                np.testing.assert_allclose(found, [*state, *rates(t, state)[m:]], atol=1e-6)
+                # Steps of 0.04 rad, to the fourth power.
+                np.testing.assert_allclose(found, [*state, *rates(t, state)[m:]], atol=5e-6)
 
 
 def test_polynomials_are_numpys():

@@ -17,7 +17,14 @@ from flexarm_control.robust import card as card_module
 from flexarm_control.robust import design as design_module
 from flexarm_control.robust import trade as trade_module
 from flexarm_control.robust.card import card, poles, torque_used
-from flexarm_control.robust.decay import Poles, Slowest, Wanted, eigenvalues
+from flexarm_control.robust.decay import (
+    Slowest,
+    Stack,
+    Wanted,
+    eigenvalues,
+    find_gradients,
+    poles_of,
+)
 from flexarm_control.robust.design import (
     CANCELLED,
     FASTEST,
@@ -232,7 +239,17 @@ def test_low_passes_that_end_the_reach_are_tried_where_the_decay_is_poor(designe
     monkeypatch.setattr(design_module, "WORTH", 0.0)
     found = design(designed.arm, QUICK)
     corner = found.sampling.torque_corner
-    assert np.isfinite(corner) and found.omega_c == min(designed.omega_c, corner)
+    assert found.omega_c == corner < designed.omega_c
+
+
+def test_a_low_pass_beyond_the_torque_s_reach_does_not_end_it(designed, monkeypatch):
+    task = design_module.Task(designed.arm, QUICK, Uncertainty(), short=True)
+    corners = task.omega_1 * np.array(task.low_passes)
+    assert corners.size and (corners < task.omega_c).all()
+    monkeypatch.setattr(design_module, "POOR", 10.0)
+    monkeypatch.setattr(design_module, "LOW_PASS", (np.inf,))
+    found = design(designed.arm, QUICK)
+    assert found.omega_c == designed.omega_c and np.isinf(found.sampling.torque_corner)
 
 
 def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed, monkeypatch):
@@ -323,10 +340,11 @@ def test_gradients_are_those_of_differences(two_link):
     q = np.array([0.0, 0.7])
     loop = sampled_loop(two_link, two_link, q, Sampling(2e-3, 3e-3, 300.0, 200.0))
     K = 0.1 * np.random.default_rng(2).standard_normal((2, 14))
-    closed, z = eigenvalues(loop, K)
-    step = 1e-6
-    for one in z[np.argsort(-np.abs(z))][:6]:
-        (exact,) = Poles(loop, closed, np.array([one])).gradients(1)
+    stack = Stack([loop], 0.1 * np.ones_like(K))
+    (poles,) = poles_of([stack], [K[None]], Wanted(2.75, 200.0, 3e-3))
+    find_gradients([poles], [np.array([6])])
+    z, step = np.exp(poles.s[0] * loop.period), 1e-6
+    for one, exact in zip(z, poles.slopes[0], strict=False):
         for a, b in ((0, 0), (1, 3), (0, 4), (1, 9), (0, 13)):
             move = np.zeros_like(K)
             move[a, b] = step
@@ -347,7 +365,7 @@ def test_the_smooth_maximum_is_just_above_the_largest_value_and_has_its_slope(tw
     x = 0.05 * np.random.default_rng(3).standard_normal(slowest.free.sum())
     function = slowest.smooth(loops, 0.05)
     value, slope = function(x)
-    largest = slowest.worst(slowest.values(x))[0]
+    largest = max(one.v for one in slowest.each(x))
     assert largest <= value < largest + 0.05 * max(1.0, abs(largest)) * np.log(60)
     for i in (0, 3, 7, 12):
         move = np.zeros(x.size)

@@ -110,20 +110,32 @@ def test_loops_between_the_configurations_have_the_mean_of_the_sets(scheduled):
     x = np.random.default_rng(2).uniform(0.0, 0.3, slowest.size)
     sets = slowest.gains(x)
     assert_allclose(slowest.scaled(sets), x, rtol=1e-12)
-    for loop, w in zip(slowest.loops, weights, strict=True):
-        assert_allclose(slowest.gains_of(loop, x), np.tensordot(w, sets, 1), rtol=1e-12)
+    for K, w in zip(slowest.of_loops(slowest.loops, x), weights, strict=True):
+        assert_allclose(K, np.tensordot(w, sets, 1), rtol=1e-12)
 
 
 def test_the_gradient_by_all_sets_is_that_of_differences(scheduled):
     slowest, _ = scheduled
     draw = np.random.default_rng(2)
     x, way = draw.uniform(0.05, 0.3, slowest.size), draw.standard_normal(slowest.size)
-    worst = lambda x: slowest.worst(slowest.values(x))  # noqa: E731
-    _, slope, loop, _, _ = worst(x)
-    step = 1e-6
-    ahead, back = (worst(x + sign * step * way) for sign in (1.0, -1.0))
-    assert ahead[2] is loop and back[2] is loop
-    assert_allclose(slope @ way, (ahead[0] - back[0]) / (2.0 * step), rtol=1e-4)
+    function, step = slowest.smooth(slowest.loops, 1e-3), 1e-6
+    slope = function(x)[1]
+    ahead, back = (function(x + sign * step * way)[0] for sign in (1.0, -1.0))
+    assert_allclose(slope @ way, (ahead - back) / (2.0 * step), rtol=1e-4)
+    assert len(slope.reshape(3, -1)[np.abs(slope.reshape(3, -1)).max(axis=1) > 0.0]) > 1
+
+
+def test_the_slope_of_each_loop_s_pole_is_that_of_all_sets(scheduled):
+    slowest, weights = scheduled
+    x = np.random.default_rng(2).uniform(0.05, 0.3, slowest.size)
+    k, step = len(weights) - 1, 1e-6
+    assert 0.0 < weights[k].max() < 1.0
+    found = slowest.each(x)[k]
+    difference = [
+        (slowest.each(x + step * e)[k].v - slowest.each(x - step * e)[k].v) / (2.0 * step)
+        for e in np.eye(x.size)
+    ]
+    assert_allclose(found.slope, np.linalg.norm(difference), rtol=1e-4)
 
 
 def test_loops_that_limit_the_others_are_asked_less_once(scheduled):

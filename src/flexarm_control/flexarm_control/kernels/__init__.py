@@ -8,7 +8,18 @@ from functools import cache
 
 from flexarm_dynamics.kernels import load, rigid
 
-from . import eigenvectors, law, limits, manifold, readings, responses, steps, strains
+from . import (
+    eigenvectors,
+    lapack,
+    law,
+    limits,
+    manifold,
+    poles,
+    readings,
+    responses,
+    steps,
+    strains,
+)
 
 
 @cache
@@ -22,10 +33,13 @@ def compiled():
             law,
             limits,
             manifold,
+            poles,
             readings,
             responses,
             steps,
             strains,
         )
     ]
-    return load.joined("control", sources, inline=("larger", "unit", "solve"))
+    module = load.joined("control", sources, inline=("larger", "unit", "solve"))
+    vars(module).update(lapack.routines())
+    return module

@@ -575,6 +575,8 @@ class ArmController:
         missed = max(sample.sequence - order.sequence - 1, 0)
         if verdict != SampleOrder.REPEAT:
             order.take(sample)  # a bad one, too: the next one is compared with it
+        if verdict == SampleOrder.RESTART:
+            self._applied.forget()  # in a fault, too: the driver may not have found this controller yet
         if verdict == SampleOrder.JUMP:
             raise _refused_stamp(
                 -since_ns, "s before the last state, so the source's clock went back"
@@ -631,8 +633,6 @@ class ArmController:
 
     def _begin(self, sample, verdict):
         """Begin with the first torque of a session, or after a time without torque, from the present position."""
-        if verdict == SampleOrder.RESTART:
-            self._applied.forget()
         keeps = self._waiting and verdict != SampleOrder.RESTART and self.reference.pending
         if keeps and (given_up := self._left_behind(sample)):
             self._trajectory_reason = given_up

@@ -20,21 +20,24 @@ see.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgehrd, dgehrd_lwork, dorghr, dorghr_lwork
+from scipy.linalg import matrix_balance
 
 from ..kernels import compiled
+from ..kernels.poles import DEAD_BEAT
+from .threads import in_parts
 
 #: A pole counts as one that no gain moves below this change of v by one unit of all scaled gains.
 UNMOVED = 0.01
+#: A pole that grows by more than this counts whether or not gains move it [-].
+GROWS = 1e-9
 #: So many poles of a loop are looked at for one that gains move.
 MOST = 12
-#: Beyond this many times omega_1 less decay is asked.
-SOFT = 4.0
-#: Poles nearer to the origin of the z plane are those of delays and filters.
-DEAD_BEAT = 1e-6
+#: Poles have a say in the smooth maximum from so many widths below the largest on.
+BELOW = 6.0
 
 
 @dataclass(frozen=True)
@@ -47,116 +50,138 @@ class Wanted:
 
     def decay(self, s, fraction=1.0):
         """d of each pole [1/s], of a loop of which this fraction is asked."""
-        size = np.maximum(np.abs(s), 1e-12)
-        soft = self.omega_1 * np.minimum(1.0, np.sqrt(SOFT * self.omega_1 / size))
-        beyond = np.minimum(self.omega_1, self.zeta * size)
-        asked = fraction * np.where(size <= self.omega_c, soft, beyond)
-        return np.where(s.real < 0.0, asked, self.omega_1)
+        return np.vectorize(compiled().asked, otypes=[float])(s, fraction, *self.values)
+
+    @property
+    def values(self):
+        """omega_1, omega_c and zeta, (3,)."""
+        return np.array([self.omega_1, self.omega_c, self.zeta], float)
 
 
 def eigenvalues(loop, K):
     """The closed loop's matrix, and its eigenvalues in the upper half plane but for those of delays."""
     closed = loop.F - loop.G @ (K @ loop.N)
     z = np.linalg.eigvals(closed)
-    return closed, z[_counted(z)]
+    return closed, z[(np.abs(z) > DEAD_BEAT) & (z.imag >= 0.0)]
 
 
-def _counted(z):
-    return (np.abs(z) > DEAD_BEAT) & (z.imag >= 0.0)
+class Stack:
+    """Loops with equally many states, as arrays whose first index is the loop.
 
-
-@lru_cache(maxsize=256)
-def _work(size):
-    """Sizes of LAPACK's work space for a matrix."""
-    return [int(query(size, 0, size - 1)[0]) for query in (dgehrd_lwork, dorghr_lwork)]
-
-
-def hessenberg(matrix):
-    """H and Q of a square matrix Q H Q^T, without the checks of scipy.linalg's: these cost more than the work.
-
-    What stands below H's first subdiagonal is not zero, and means nothing.
-    """
-    size = len(matrix)
-    reduced, own = _work(size)
-    H, tau, _ = dgehrd(matrix, 0, size - 1, lwork=reduced)
-    Q, _ = dorghr(H, tau, 0, size - 1, lwork=own)
-    return np.ascontiguousarray(H), Q
-
-
-class Poles:
-    """Poles of one closed loop, the largest v first.
+    Their states are scaled so that rows and columns of the closed loop are about as large, which eigenvalues need to be
+    exact. This is done for K = `scale`; other gains are assumed to be about as large.
 
     Parameters
     ----------
-    loop : Loop
-    closed : ndarray, shape (N, N)
-        F - G K N.
-    z, s, asked : ndarray, shape (k,)
-        [-], [1/s], and d [1/s].
-    v : list of float
-        [-]
+    loops : sequence of Loop
+    scale : ndarray, shape (n, 3n + 2m)
     """
 
-    def __init__(self, loop, closed, z, s=None, asked=None, v=None):
-        self.loop, self.z, self.s, self.asked, self.v = loop, z, s, asked, v
-        self._closed, self._known = closed, ()
-
-    @cached_property
-    def _reduced(self):
-        """The Hessenberg form, and G and N in its coordinates."""
-        H, Q = hessenberg(self._closed)
-        return H, Q.T @ self.loop.G, self.loop.N @ Q
-
-    def gradients(self, count):
-        """Derivatives of the real part of the first `count` poles s by the gains, (count, n, 3n + 2m).
-
-        The eigenvectors are found by inverse iteration on the loop's Hessenberg form, made once for all of its poles.
-        Zero where the matrix is singular to the last bit.
-        """
-        if len(self._known) < count:
-            H, G, N = self._reduced
-            found = np.empty((count, G.shape[1], N.shape[0]))
-            compiled().pole_gradients(H, G, N, self.z[:count], self.loop.period, found)
-            finite = np.isfinite(found).all(axis=(1, 2))
-            self._known = found if finite.all() else np.where(finite[:, None, None], found, 0.0)
-        return self._known[:count]
+    def __init__(self, loops, scale):
+        self.loops = tuple(loops)
+        F, G, N = (np.array([getattr(loop, name) for loop in loops]) for name in "FGN")
+        size = np.array([_sizes(one - g @ scale @ m) for one, g, m in zip(F, G, N, strict=True)])
+        self.F = F * size[:, None, :] / size[:, :, None]
+        self.G, self.N = G / size[:, :, None], N * size[:, None, :]
+        self.period = np.array([loop.period for loop in loops])
+        self.fraction = np.array([loop.fraction for loop in loops])
 
 
-class _Batch:
-    """Loops with equally many states, as stacks of matrices: one call finds the eigenvalues of all."""
-
-    def __init__(self, loops, at):
-        self.at = at  # their numbers
-        self.loops = [loops[k] for k in at]
-        self._F, self._G, self._N = (
-            np.array([getattr(loop, name) for loop in self.loops]) for name in "FGN"
-        )
-        self._period = np.array([loop.period for loop in self.loops])
-        self._fraction = np.array([loop.fraction for loop in self.loops])
-
-    def poles(self, K, wanted):
-        """`Poles` of each loop with its gains K (k, n, 3n + 2m)."""
-        closed = self._F - self._G @ (K @ self._N)
-        z = np.linalg.eigvals(closed)
-        counted = _counted(z)
-        row, z = np.nonzero(counted)[0], z[counted]
-        s = np.log(z) / self._period[row]
-        asked = wanted.decay(s, self._fraction[row])
-        v = s.real / asked
-        order = np.lexsort((-v, row))
-        z, s, asked, v = z[order], s[order], asked[order], v[order].tolist()
-        ends = np.cumsum(counted.sum(axis=1)).tolist()
-        for loop, matrix, a, b in zip(self.loops, closed, [0, *ends], ends, strict=False):
-            yield Poles(loop, matrix, z[a:b], s[a:b], asked[a:b], v[a:b])
+def _sizes(matrix):
+    """Sizes of states, powers of two, with which rows and columns of a matrix are about as large."""
+    return matrix_balance(matrix, permute=False, separate=True)[1][0]
 
 
-def _batches(loops):
-    """The `_Batch`es of some loops."""
-    sizes = [len(loop.F) for loop in loops]
-    return [
-        _Batch(loops, [k for k, size in enumerate(sizes) if size == one])
-        for one in sorted(set(sizes))
-    ]
+class Poles:
+    """Poles of a stack of loops under gains, of each the largest v first; see `poles_of`.
+
+    Parameters
+    ----------
+    stack : Stack
+    K : ndarray, shape (L, n, 3n + 2m)
+
+    Attributes
+    ----------
+    s, asked, v : ndarray, shape (L, N)
+        [1/s], d [1/s] and v [-]; v is -inf after the last one.
+    """
+
+    def __init__(self, stack, K):
+        self.stack, shape = stack, stack.F.shape[:2]
+        self._K = np.ascontiguousarray(K)
+        self._H, self._tau = np.empty(stack.F.shape), np.empty(shape)
+        self._z, self.s = np.empty(shape, complex), np.empty(shape, complex)
+        self.asked, self.v, self._count = np.empty(shape), np.empty(shape), np.empty(len(K), int)
+        self._known = np.zeros(len(K), int)  # gradients of the first so many poles
+        self._slopes = np.zeros((len(K), 0, *K.shape[1:]))
+
+    def ranking(self, wanted):
+        """A call for `in_parts` that finds the poles."""
+        stack, values = self.stack, wanted.values
+        arrays = (
+            stack.F, stack.G, stack.N, self._K, stack.period, stack.fraction,
+            self._H, self._tau, self._z, self.s, self.asked, self.v, self._count,
+        )  # fmt: skip
+        return partial(compiled().ranked_poles, values), arrays, stack.F.shape[1]
+
+    @property
+    def found(self):
+        """Whether the eigenvalues of all loops were found."""
+        return (self._count >= 0).all()
+
+    def missing(self, count):
+        """Calls for `in_parts` that find the gradients of the first `count` (L,) poles of each loop, if missing."""
+        if (count <= self._known).all():
+            return
+        stack, before, known = self.stack, self._slopes, self._known
+        self._known = count = np.maximum(count, known)
+        self._slopes = np.zeros((len(before), count.max(), *before.shape[2:]))
+        self._slopes[:, : before.shape[1]] = before
+        arrays = (
+            self._H, self._tau, stack.G, stack.N, self._z, known, count, stack.period, self._slopes,
+        )  # fmt: skip
+        yield compiled().pole_gradients, arrays, stack.F.shape[1]
+
+    @property
+    def slopes(self):
+        """Derivatives of the real part of poles s by the gains of their loop, (L, p, n, 3n + 2m); 0 where not known."""
+        return self._slopes
+
+
+def poles_of(stacks, gains, wanted):
+    """`Poles` of the loops of some stacks.
+
+    Parameters
+    ----------
+    stacks : sequence of Stack
+    gains : sequence of ndarray, shape (L, n, 3n + 2m)
+        Of each loop of each stack.
+    wanted : Wanted
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where the eigenvalues of a loop are not found.
+    """
+    all_ = [Poles(stack, K) for stack, K in zip(stacks, gains, strict=True)]
+    in_parts([one.ranking(wanted) for one in all_])
+    if not all(one.found for one in all_):
+        raise np.linalg.LinAlgError("eigenvalues that are not found")
+    return all_
+
+
+def find_gradients(all_, counts):
+    """Find the gradients of the first poles of each loop, so many of each as `counts` says, one (L,) of each stack."""
+    in_parts([call for one, count in zip(all_, counts, strict=True) for call in one.missing(count)])
+
+
+class Moved(NamedTuple):
+    """The pole of a loop with the largest v of those that gains move."""
+
+    v: float  # [-]; -inf: gains move none
+    s: complex  # [1/s]
+    slope: float  # length of the gradient of v by the scaled gains [-]
+    passed: tuple  # poles with larger v that gains do not move [1/s]
 
 
 class Slowest:
@@ -186,99 +211,128 @@ class Slowest:
         """Scaled gains x of K."""
         return K[self.free] / self._unit
 
-    def gains_of(self, loop, x):
-        """K that a loop has under scaled gains x."""
-        return self.gains(x)
+    def of_loops(self, loops, x):
+        """K that each of some loops has under scaled gains x, (L, n, 3n + 2m)."""
+        return np.repeat(self.gains(x)[None], len(loops), axis=0)
 
-    @cached_property
-    def _all(self):
-        return _batches(self.loops)
+    def _of_all(self, loops, slopes):
+        """Gradient by x from those by the scaled gains of each loop, (L, gains)."""
+        return slopes.sum(axis=0)
 
-    def values(self, x):
-        """The `Poles` of each loop under scaled gains x."""
-        return self._values(x, self._all, len(self.loops))
-
-    def _values(self, x, batches, count):
-        found = [None] * count
-        for batch in batches:
-            K = np.array([self.gains_of(loop, x) for loop in batch.loops])
-            for k, poles in zip(batch.at, batch.poles(K, self.wanted), strict=True):
-                found[k] = poles
-        return found
-
-    def _slopes(self, poles, count):
-        """Gradients of the v of the first `count` poles by the scaled gains of the loop, (count, gains)."""
-        found = poles.gradients(count)[:, self.free]
-        return found * (self._unit / poles.asked[:count, None])
-
-    def _of_all(self, loop, slope):
-        """Gradient by x from that by a loop's own scaled gains."""
-        return slope
-
-    def _length(self, loop, slopes):
-        """Lengths of the gradients by x from those by a loop's own scaled gains, (..., gains)."""
+    def _lengths(self, loops, slopes):
+        """Lengths of the gradients by x from those by the scaled gains of each loop, (L, p, gains)."""
         return np.sqrt((slopes**2).sum(axis=-1))
 
-    def worst(self, found):
-        """The largest v of poles that gains move, with loop, s and the gradient by x; unmoved ones are passed over.
+    def each(self, x):
+        """What is `Moved` of each loop under scaled gains x, a list in the order of the loops.
 
-        `found` as `values` returns it. Returns v, gradient, loop, s, and the poles that were passed over.
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            Where the eigenvalues of a loop are not found.
         """
-        k, i, slope, unmoved = self._first_moved(found)
-        passed = [(found[k].loop, found[k].s[i]) for k, i in unmoved]
-        if slope is None:
-            return -np.inf, np.zeros(self.size), None, 0.0, passed
-        poles = found[k]
-        return poles.v[i], self._of_all(poles.loop, slope), poles.loop, poles.s[i], passed
+        found = [None] * len(self.loops)
+        for (at, _), poles in zip(
+            self._all, self._poles([s for _, s in self._all], x), strict=True
+        ):
+            for number, moved in zip(at, self._moved(poles), strict=True):
+                found[number] = moved
+        return found
 
-    def _first_moved(self, found):
-        """Numbers of loop and pole of the largest v that gains move, its gradient, and the numbers passed over."""
-        unmoved, at = [], [0] * len(found)
-        while True:
-            left = [
-                (poles.v[i], k)
-                for k, (poles, i) in enumerate(zip(found, at, strict=True))
-                if i < min(MOST, len(poles.v))
-            ]
+    def _moved(self, poles):
+        """What is `Moved` of each loop of a stack."""
+        found, passed = [None] * len(poles.v), [()] * len(poles.v)
+        for at in range(min(MOST, poles.v.shape[1])):
+            left = [k for k, v in enumerate(poles.v[:, at]) if found[k] is None and v > -np.inf]
             if not left:
-                return None, None, None, unmoved
-            v, k = max(left)
-            i, at[k] = at[k], at[k] + 1
-            slope = self._slopes(found[k], i + 1)[i]
-            if v > 1e-9 or self._length(found[k].loop, slope) > UNMOVED:
-                return k, i, slope, unmoved
-            unmoved.append((k, i))
+                break
+            count = np.zeros(len(found), int)
+            count[left] = at + 1
+            find_gradients([poles], [count])
+            lengths = self._near(poles, at + 1)[1]
+            for k in left:
+                v, s, slope = float(poles.v[k, at]), complex(poles.s[k, at]), float(lengths[k, at])
+                if v > GROWS or slope > UNMOVED:
+                    found[k] = Moved(v, s, slope, passed[k])
+                else:
+                    passed[k] += (s,)
+        none = (Moved(-np.inf, 0j, 0.0, rest) for rest in passed)
+        return [one or other for one, other in zip(found, none, strict=True)]
+
+    def _near(self, poles, count):
+        """Gradients of the v of the first `count` poles of each loop by its scaled gains, and their lengths by x.
+
+        `find_gradients` must have found them. (L, count, gains) and (L, count).
+        """
+        slopes = poles.slopes[:, :count, self.free]
+        slopes = slopes * (self._unit / poles.asked[:, :count, None])
+        return slopes, self._lengths(poles.stack.loops, slopes)
 
     def smooth(self, loops, width):
         r"""A smooth function of x above the largest v of some loops, and its gradient.
 
         .. math:: w\ln\sum_i e^{v_i/w}
 
-        over all poles that gains move, of a `width` w: all that are near the largest have a say.
+        over all poles that gains move, of a `width` w: all that are near the largest have a say. Infinite where
+        eigenvalues are not found.
         """
-        batches = _batches(loops)
+        stacks = [stack for _, stack in self._stacks(loops)]
 
         def function(x):
             try:
-                found = self._values(x, batches, len(loops))
-                k, i, _, _ = self._first_moved(found)
-                worst = -np.inf if k is None else found[k].v[i]
-                w = width * max(1.0, abs(worst))
-                total, slope = 0.0, np.zeros(x.size)
-                for poles in found:
-                    count = sum(value >= worst - 6.0 * w for value in poles.v)
-                    if not count:
-                        continue
-                    v, slopes = np.array(poles.v[:count]), self._slopes(poles, count)
-                    stays = (v < 0.0) & (self._length(poles.loop, slopes) < UNMOVED)
-                    weight = np.where(stays, 0.0, np.exp((v - worst) / w))
-                    total += weight.sum()
-                    slope += self._of_all(poles.loop, weight @ slopes)
-            except (np.linalg.LinAlgError, ValueError):
+                found = self._poles(stacks, x)
+            except np.linalg.LinAlgError:
                 return np.inf, np.zeros(x.size)
-            return worst + w * np.log(total), slope / total
+            worst = max(poles.v.max() for poles in found)
+            while np.isfinite(worst):
+                w = width * max(1.0, abs(worst))
+                least = worst - BELOW * w
+                near = self._moving(found, least)
+                most = max(v.max(initial=-np.inf) for v, _ in near)
+                if most == worst:
+                    return self._sum(found, near, worst, w)
+                if most == -np.inf:  # gains move none of them
+                    most = max(poles.v[poles.v < least].max(initial=-np.inf) for poles in found)
+                worst = most
+            return np.inf, np.zeros(x.size)
 
         return function
+
+    def _moving(self, found, least):
+        """Of each stack the v that are at least so large, -inf of those that gains do not move, and their gradients."""
+        counts = [(poles.v >= least).sum(axis=1) for poles in found]
+        find_gradients(found, counts)
+        near = []
+        for poles, count in zip(found, counts, strict=True):
+            most = count.max()
+            slopes, lengths = self._near(poles, most)
+            v = poles.v[:, :most].copy()
+            v[(v < least) | ((v <= GROWS) & (lengths <= UNMOVED))] = -np.inf
+            near.append((v, slopes))
+        return near
+
+    def _sum(self, found, near, worst, w):
+        """What is `smooth`, and its gradient."""
+        total, slope = 0.0, 0.0
+        for poles, (v, slopes) in zip(found, near, strict=True):
+            weight = np.exp((v - worst) / w)
+            total += weight.sum()
+            of_loops = (weight[:, None, :] @ slopes)[:, 0, :]
+            slope = slope + self._of_all(poles.stack.loops, of_loops)
+        return worst + w * np.log(total), slope / total
+
+    def _poles(self, stacks, x):
+        return poles_of(stacks, [self.of_loops(stack.loops, x) for stack in stacks], self.wanted)
+
+    @cached_property
+    def _all(self):
+        return self._stacks(self.loops)
+
+    def _stacks(self, loops):
+        """Numbers of loops with equally many states, and their `Stack`."""
+        sizes = [len(loop.F) for loop in loops]
+        same = [[k for k, size in enumerate(sizes) if size == one] for one in sorted(set(sizes))]
+        return [(at, Stack([loops[k] for k in at], self.scale)) for at in same]
 
 
 class SlowestScheduled(Slowest):
@@ -304,14 +358,18 @@ class SlowestScheduled(Slowest):
     def scaled(self, K):
         return np.concatenate([super(SlowestScheduled, self).scaled(one) for one in K])
 
-    def gains_of(self, loop, x):
-        return super().gains(self._weights[id(loop)] @ self._split(x))
+    def of_loops(self, loops, x):
+        return np.tensordot(self._of(loops), self.gains(x), 1)
+
+    def _of(self, loops):
+        """Weights of all sets in some loops, (L, k)."""
+        return np.array([self._weights[id(loop)] for loop in loops])
 
     def _split(self, x):
         return x.reshape(-1, self._unit.size)
 
-    def _of_all(self, loop, slope):
-        return np.outer(self._weights[id(loop)], slope).ravel()
+    def _of_all(self, loops, slopes):
+        return (self._of(loops).T @ slopes).ravel()
 
-    def _length(self, loop, slopes):
-        return np.linalg.norm(self._weights[id(loop)]) * super()._length(loop, slopes)
+    def _lengths(self, loops, slopes):
+        return np.linalg.norm(self._of(loops), axis=1)[:, None] * super()._lengths(loops, slopes)

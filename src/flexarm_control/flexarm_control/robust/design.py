@@ -62,7 +62,7 @@ FROM_LIMITS = "an arm with faster gains would not come back from them in time"
 #: modes only their own damping is asked. Taken where the decay is so many times larger [-].
 POOR, WORTH = 0.25, 1.2
 #: Where those reach less than this, one set for all is tried, too; the same without them, where that is below
-#: `further.LEAST` [-].
+#: `further.LEAST`, or below this if there are no such low passes [-].
 LITTLE = 0.08
 #: Where the decay that is reached is less than this, the search goes on from gains nearby, at most so many times, and
 #: looks at arms of which payload or stiffness alone differs, too. Then it does so for the loops that do not limit the
@@ -489,11 +489,13 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
     task, say = Task(arm, settings, uncertainty), _Progress(progress)
     found = task.found(say.part(0.0, USUAL), gains, -np.inf)
     if found.decay < POOR * task.speed:
-        short = Task(arm, settings, uncertainty, short=True)
-        other = short.found(say.part(USUAL, OTHERWISE), gains, LITTLE)
-        if max(found.decay, other.decay) < LEAST:
+        short, other = Task(arm, settings, uncertainty, short=True), None
+        if short.low_passes:
+            other = short.found(say.part(USUAL, OTHERWISE), gains, LITTLE)
+        reached = other.decay if other is not None else -np.inf
+        if max(found.decay, reached) < (LEAST if short.low_passes else LITTLE):
             found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
-        if other.decay > max(WORTH * found.decay, 0.0):
+        if reached > max(WORTH * found.decay, 0.0):
             task, found = short, other
     if found.decay < SLOW * task.speed:
         task = Task(arm, settings, replace(uncertainty, edges=True), task.short)
@@ -553,7 +555,7 @@ class Task:
     settings : Settings
     uncertainty : Uncertainty
     short : bool
-        Whether the torque has low passes that end its reach.
+        Whether the torque has low passes that end its reach, and no others.
 
     Attributes
     ----------
@@ -563,11 +565,12 @@ class Task:
         Configurations [rad].
     speed : float
         Of the settings, and at least `SLOWEST` [-].
+    low_passes : tuple of float
+        Corners that are tried, over omega_1; if `short`, those below omega_c: there may be none.
     """
 
     def __init__(self, arm, settings, uncertainty, short=False):
         self.short = short
-        self._low_passes = LOW_PASS[1:] if short else LOW_PASS
         self.arm, self.settings, self.uncertainty = arm, settings, uncertainty
         self.nominal = nominal = build(arm.known)
         self.at = at = places(nominal, settings)
@@ -575,6 +578,9 @@ class Task:
             self.at = at[:1]  # the same loops everywhere
         self.omega_1 = lowest(nominal)
         self.sampling, self.omega_c = sampling_for(nominal, self.at, settings)
+        self.low_passes = tuple(
+            factor for factor in LOW_PASS if not short or factor * self.omega_1 < self.omega_c
+        )
         self.wanted = Wanted(self.omega_1, self.omega_c, own_damping(arm, uncertainty))
         self.scale = units(nominal, self.at, self.omega_1)
         self.speed = max(settings.speed, SLOWEST)
@@ -618,7 +624,7 @@ class Task:
         chosen, x = race(searches, self.settings.effort, say)
         found, used = [(searches[chosen][0], x)], sum(one.evaluations for one, _ in searches)
         for k in range(1, count):
-            low_pass = self._low_passes[chosen]
+            low_pass = self.low_passes[chosen]
             search, starts = self._search(low_pass, self.at[k : k + 1], k + 1)
             near = min((x for _, x in found), key=search.value)
             found.append((search, follow(search, [near, starts[0]], self.settings.effort)))
@@ -675,7 +681,7 @@ class Task:
 
     def _searches(self, at, gains):
         """A search with each low pass, and its starts."""
-        found = [self._search(factor, at) for factor in self._low_passes]
+        found = [self._search(factor, at) for factor in self.low_passes]
         if gains is None:
             return found
         return [(search, [*starts, search.slowest.scaled(gains)]) for search, starts in found]
@@ -698,16 +704,17 @@ class Task:
 
     def sets(self, search, x, used):
         """`Sets` of a search's scaled gains x."""
-        slowest, rows, left, slopes = search.slowest, [], [], []
-        for one in slowest.values(x):
-            v, slope, _, s, unmoved = slowest.worst([one])
-            rows.append(SlowPole(one.loop.name, complex(s), float(v), one.loop.kind))
-            slopes.append(float(np.linalg.norm(slope)))
-            left += [round(abs(s), 1) for loop, s in unmoved if loop is slowest.loops[0]]
+        slowest = search.slowest
+        each = slowest.each(x)
+        rows = tuple(
+            SlowPole(loop.name, one.s, one.v, loop.kind)
+            for loop, one in zip(slowest.loops, each, strict=True)
+        )
+        left = {round(abs(s), 1) for s in each[0].passed}
         K = slowest.gains(x).reshape(-1, *self.scale.shape)
         noise = np.max([search.noise.shares(one) for one in K], axis=0)
-        slope = slopes[int(np.argmax([row.value for row in rows]))]
-        return Sets(K, search.sampling, tuple(rows), tuple(sorted(set(left))), noise, slope, used)
+        slope = max(each, key=lambda one: one.v).slope
+        return Sets(K, search.sampling, rows, tuple(sorted(left)), noise, slope, used)
 
     def design(self, sets):
         """The `Design` with these `Sets`."""

@@ -50,22 +50,18 @@ class Noise:
         self._slowest, self._allowed = slowest, allowed
 
     def shares(self, K):
-        """Rms torque of the noise over the limit, (n,) [-]."""
-        return np.linalg.norm(K * self._share, axis=1)
+        """Rms torque of the noise over the limit, (..., n) [-]."""
+        return np.sqrt(((K * self._share) ** 2).sum(axis=-1))
 
     def __call__(self, x):
         """The penalty of scaled gains, and its gradient."""
-        slowest, value, slopes = self._slowest, 0.0, []
-        gains = slowest.gains(x)
-        for K in gains.reshape(-1, *slowest.scale.shape):
-            shares = self.shares(K)
-            over = np.maximum(np.log(np.maximum(shares, 1e-300) / self._allowed), 0.0)
-            slope = np.zeros_like(K)
-            for i in np.flatnonzero(over > 0.0):
-                slope[i] = 2.0 * over[i] / shares[i] ** 2 * K[i] * self._share[i] ** 2
-            value += float(over @ over)
-            slopes.append((slope * slowest.scale)[slowest.free])
-        return value, np.concatenate(slopes)
+        slowest = self._slowest
+        K = slowest.gains(x).reshape(-1, *slowest.scale.shape)
+        shares = self.shares(K)
+        over = np.log(np.maximum(shares / self._allowed, 1.0))
+        slope = (2.0 * over / np.maximum(shares, self._allowed) ** 2)[..., None] * K
+        slope *= self._share**2 * slowest.scale
+        return float((over**2).sum()), slope[:, slowest.free].ravel()
 
 
 def _passed(sampling, corner):

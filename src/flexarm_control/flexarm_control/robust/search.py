@@ -175,7 +175,7 @@ class Search:
     def _each(self, x):
         """The slowest pole of each loop that gains move, as a value."""
         self.evaluations += 1
-        return [self.slowest.worst([found])[0] for found in self.slowest.values(x)]
+        return [one.v for one in self.slowest.each(x)]
 
     def _with_penalty(self, each, x):
         return float(max(each) + self._penalty(x)[0])
