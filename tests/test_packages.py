@@ -56,8 +56,8 @@ JAZZY |= {
 }
 #: Needed and not imported.
 USED_OTHERWISE = {("flexarm_bringup", "ros2launch"), ("flexarm_bringup", "flexarm_tools")}
-#: Options that only their own commands or modules need, without a key.
-WITHOUT = {"distributed", "foxglove", "gymnasium", "viser", "websockets"}
+#: Options that only their own commands or modules need, without a key; llvmlite is part of numba.
+WITHOUT = {"distributed", "foxglove", "gymnasium", "llvmlite", "viser", "websockets"}
 #: Tests of a package below that look at one above: a key would make a circle, which colcon refuses.
 CIRCLES = {
     ("flexarm_ros", "flexarm_control"),
