@@ -175,8 +175,8 @@ ERRORS = [
         ),
         (
             "design",
-            "after a motion: gains are taken however much torque limits delay the arm",
-            "if not delayed(sooner.recovery, made.recovery):",
+            "after a motion: gains are taken however late the arm is under its torque limits",
+            "if not later(sooner.recovery, made.recovery):",
             "if True:",
         ),
         (

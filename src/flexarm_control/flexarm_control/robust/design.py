@@ -27,7 +27,7 @@ from ..feedforward.model import METHOD
 from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
-from .further import LEAST, delayed, leaving_less
+from .further import LEAST, later, leaving_less
 from .held import held_loops
 from .loop import ARM, STICKS, Sampling
 from .noise import Noise
@@ -506,7 +506,7 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
         other = leaving_less(edged, found, say.part(NEARBY, 1.0), asked)
         if other is not None:
             sooner = edged.design(other)
-            if not delayed(sooner.recovery, made.recovery):
+            if not later(sooner.recovery, made.recovery):
                 made = sooner
     say.part(0.0, 1.0)(1.0, made.decay)
     return made

@@ -15,9 +15,6 @@ PLACES = 3
 #: Its gains are not taken if, where joints rub, the slowest pole that rings loses more than this part of its decay, and
 #: then has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
 SHORTER, RINGS = 0.1, 0.03
-#: Nor are they taken if the torque limits delay the arm by more locked periods than this, so that it settles later than
-#: before, or if it came back from them before and does not now.
-DELAYED = 1.0
 
 
 class Further(NamedTuple):
@@ -90,12 +87,15 @@ def leaving_less(task, found, progress, speed=None):
     return task.sets(whole, other, used)
 
 
-def delayed(now, before):
-    """Whether the torque limits are a reason not to take gains, by the `Recovery` with these and with those before."""
+def later(now, before):
+    """Whether an arm settles later under its torque limits, by the `Recovery` with some gains and with those before.
+
+    J is without limits. Where the two contradict each other, the gains are not taken; nor are they if the arm came back
+    from its limits before and does not now.
+    """
     if now is None or before is None:
         return False
-    lost = before.comes_back and not now.comes_back
-    return lost or (now.later > DELAYED and now.limited > before.limited)
+    return now.limited > before.limited or (before.comes_back and not now.comes_back)
 
 
 def _kept(reached):
