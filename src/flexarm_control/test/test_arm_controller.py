@@ -420,6 +420,22 @@ def test_an_arm_under_gravity_is_held_from_the_first_sample_on(long_reach):
     assert np.abs(authority.torque).max() > 50.0
 
 
+def test_the_first_torque_of_an_arm_at_rest_is_within_the_limit_too(long_reach):
+    """Where the weight takes nearly all of the torque."""
+    sizes = {"joints": 4, "modes": long_reach.n_modes}
+    q = np.array([0.0, 1.2, 0.8, -0.8])
+    authority = Authority(long_reach, check_all(PARAMETERS, {}, sizes))
+    authority.begin(q, True)
+    weight = authority.torque.copy()
+    limit = 1.01 * np.maximum(np.abs(weight), 1.0)
+    authority.configure(check_all(PARAMETERS, {"torque_limit": limit.tolist()}, sizes))
+    authority.begin(q, True)
+    assert authority.send(weight + np.sign(weight) * 0.015 * limit, 1e-3, 1e-3)
+    heavy = np.abs(weight) > 1.0
+    assert heavy.any()
+    assert_allclose(np.abs(authority.torque[heavy]), limit[heavy])
+
+
 def test_the_budget_of_the_torques_change_is_the_files_or_from_limit_and_lowest_frequency(arm_r):
     def rate(model, **settings):
         sizes = {"joints": 1, "modes": 2}

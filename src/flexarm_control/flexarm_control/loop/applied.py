@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks whether the driver applies the torque sent to it, by the torque and controller that it reports.
 
-A driver that refuses, clips or replaces the torque leaves the arm on its safe action while the reference goes on.
-Two reports show this. The torque that it reports as applied must lie between the smallest and the largest of the last
-`SENT` answers, within `torque_mismatch` times the torque limit; so no delay needs to be known. A driver that
-confirms its controller (``controller_id``) must name this one. A contradiction that lasts `PATIENCE` is a refusal.
+A driver may refuse, clip or replace the torque. The arm then takes its safe action, for example, while the reference
+goes on. Two reports of the driver show this. The torque that it reports as applied must lie between the smallest and
+the largest of the last `SENT` torques sent, within `torque_mismatch` times the torque limit; so the delay need not be
+known. If the driver confirms its controller (``controller_id``), it must name this one. A contradiction that lasts
+`PATIENCE` is a refusal.
 
-A driver names its controller one sample before it applies its torque. If it does so for the first time long after the
-first torque was sent (say, because DDS had not found it yet), the torque has to start again, since the reference may be
-far away.
+A driver names a controller one sample before it applies that controller's torque. It may name this one for the first
+time long after the first torque was sent, for example because DDS discovery was slow. Then the torque has to start
+again, since the reference may be far away.
 """
 
 import numpy as np
@@ -17,9 +18,9 @@ from flexarm_dynamics.parameters import parameter
 
 from .. import kernels
 
-#: Number of last answers that the reported torque may belong to.
+#: The reported torque may be any of this many torques sent last.
 SENT = 64
-#: A contradiction that lasts this long is a refusal [s]. This is several of the driver's timeouts, since a machine that
+#: A contradiction that lasts this long is a refusal [s]. It is several times the driver's timeout, since a machine that
 #: is busy for a moment does not refuse.
 PATIENCE = 0.25
 
@@ -51,7 +52,7 @@ class Applied:
         self.begin(np.zeros(model.n_joints))
 
     def configure(self, settings, limit):
-        """Take another tolerance."""
+        """Take a new tolerance and new torque limits."""
         share = settings["torque_mismatch"]
         self._tolerance = np.where(np.isfinite(limit), share * limit, np.inf) if share else None
 
@@ -108,7 +109,7 @@ class Applied:
         return not confirmed and (self._confirms or sample.controller_id != 0)
 
     def back_after(self, sample, controller_id):
-        """How long the driver applied none of this controller's torque, if it applies it again by this sample [s]."""
+        """How long the driver applied no torque of this controller [s], if this sample confirms it again; else 0."""
         if not controller_id or sample.controller_id != controller_id:
             return 0.0
         return max(self._other_for, self._unconfirmed_for)

@@ -21,18 +21,19 @@ from .torque_delay import TorqueDelay
 #: Duration of the ramp in which the fast control is switched on or off [s].
 FAST_RAMP = 0.1
 
-#: When a source restarts during operation, each joint must be this close to where it was [rad], and at rest [rad/s].
+#: If the source restarts during operation, each joint must be this close to its last position [rad], and no faster
+#: than this [rad/s].
 SAME_PLACE, AT_REST = 0.01, 0.05
-#: An arm that seems to move is watched this long before its first torque, as a velocity may be noise or a swing [s].
+#: An arm that seems to move is watched this long before its first torque: the velocity may be noise or a swing [s].
 SEEN = 0.01
-#: This many periods without a state are no interruption, however long they are.
+#: A gap of up to this many periods is no interruption, however long a period is.
 PERIODS_OF_GAP = 5.0
-#: Text of a doubt that its source does not explain.
+#: Text of a doubt for which the source gives no reason.
 UNSTATED = "the source asks for a stop"
-#: More repeats of one state than this are a fault, since repeats are no sign of life.
+#: More repeats of one state than this are a fault: the source then measures nothing new.
 MAX_REPEATS = 10
 
-#: Parameters of the controller that belong to no single law.
+#: Parameters of the controller itself, which belong to none of its laws.
 PARAMETERS = (
     *authority.PARAMETERS,
     *applied.PARAMETERS,
@@ -71,7 +72,7 @@ class ArmController:
     Parameters
     ----------
     model : ArmModel
-        The arm as the controller knows it.
+        The controller's model of the arm.
     law : CompositeControl
     settings : mapping
         Checked values of `PARAMETERS`.
@@ -83,7 +84,7 @@ class ArmController:
     torque : ndarray
         Torque to send [N m], shape (n,); zero when not `enabled`.
     enabled : bool
-        Whether the torque may be applied, or each joint's safe action is to be taken.
+        Whether the torque may be applied; if not, each joint takes its safe action.
     supervisor : Supervisor
         State and limits.
     law, answered_by : CompositeControl
@@ -94,14 +95,14 @@ class ArmController:
     saturated : bool
         Whether a limit was met at this sample.
     late, missed, interruptions : int
-        Numbers of samples that came after a later one and were ignored, of samples that never came, and of gaps in
-        which torque was lost.
+        Number of samples that came after a later one and were ignored; number of samples that never came; number of
+        times that torque was lost and returned.
     alive : bool
         Whether the last sample was a sign of life of the source: it was new, or the source's clock stands still.
     torque_delay : TorqueDelay
         Measures how long after a state's stamp its torque acts, from what the driver reports.
     controller_id : int
-        Id under which torques are sent; 0: unknown, and not compared with the id that the driver confirms.
+        Id under which torques are sent. 0: it is unknown, and the id that the driver confirms is not checked.
     judged : tuple of str
         Name of the last trajectory that was accepted or refused, and the reason for a refusal, or empty.
     payload : PayloadEstimator or None
@@ -125,11 +126,11 @@ class ArmController:
         self.enabled, self.saturated, self.fast_enabled = False, False, True
         self._trajectory_reason, self.judged = "", ("", "")
         self._waiting = False  # joints known, deflections not yet
-        self._seen = []  # stamp and positions of one or two samples meanwhile
+        self._seen = []  # stamp and positions of one or two samples, while waiting
         self.late = self.missed = self.controller_id = 0
         self._order, self._repeats = SampleOrder(), 0
         self._last_ns, self._period = 0, 0.0  # [ns], [s]
-        self._jumped_ns = 0  # how far the source's clock jumped ahead of the reference's own [ns]
+        self._jumped_ns = 0  # how far the source's clock jumped ahead of the reference's time [ns]
         self._count = 1  # states since the last one, missed ones included
         self._doubt = ""  # of the last sample
         self._foreign = self.interruptions = 0
@@ -160,7 +161,7 @@ class ArmController:
         return PayloadEstimator(self.model, mode, settings["payload_limit"])
 
     def replace_law(self, law):
-        """Go on with another control, from the states of the present one; call between two samples."""
+        """Replace the control by another, which continues from its states; call between two samples."""
         law.resume(self.law)
         self.law = law
 
@@ -179,7 +180,7 @@ class ArmController:
 
     @property
     def payload_wanted(self):
-        """Payload that the control should be designed for now; None: keep the present one, or the arm does not rest."""
+        """Payload scale to design the control for now [-]; None: keep the present one, as always in motion."""
         found = self.payload
         if found is None or found.reason or self.law.slow.learns:
             return None
@@ -192,18 +193,18 @@ class ArmController:
     @property
     def _rests(self):
         at_rest = self.state in (State.READY, State.HOLDING) and self.reference.resting is not None
-        # An arm that swings stands still at its turning points, too.
+        # A swinging arm is slow at its turning points, too. So it must be slow for half a period.
         return at_rest and not self._doubt and self._slow_for >= 0.5 * self._bending_period
 
     def carry(self, law):
-        """Go on with a control for another payload; returns False, and changes nothing, if the arm does not rest."""
+        """Take a control for another payload; returns False, and changes nothing, if the arm does not rest."""
         if not self._rests:
             return False
         self.replace_law(law)
         return True
 
     def _note(self, sample, dt):
-        """Keep the data of a sample that the payload estimate needs, before the sample's torque is computed."""
+        """Give the payload estimate what it needs of a sample; call this before the sample's torque is computed."""
         slow = np.abs(sample.velocity).max() < AT_REST
         self._slow_for = self._slow_for + dt if slow else 0.0
         if self._doubt:
@@ -221,7 +222,7 @@ class ArmController:
         Raises
         ------
         ParameterError
-            Nothing has changed then.
+            If a limit can't be used; then nothing has changed.
         """
         self.supervisor.configure(settings, self._authority.limits_of(settings))
         self._authority.configure(settings)
@@ -275,7 +276,7 @@ class ArmController:
             "quasi_steady_amplitude": law.quasi_steady,
             "fast_deviation": law.deviation,
         }
-        if not self.enabled:  # they are those of an earlier sample
+        if not self.enabled:  # the stored ones are those of an earlier sample
             computed = dict.fromkeys(computed, 0.0)
         return {
             "reference_position": reference.position,
@@ -291,7 +292,7 @@ class ArmController:
 
     @property
     def held(self):
-        """Where joints stay that a trajectory leaves out, (n,) [rad]; None: it must name all. Any thread may ask."""
+        """Positions of joints that a trajectory leaves out, (n,) [rad]; None: it must name all. Any thread may ask."""
         if not self.supervisor.settings["allow_partial_joints_goal"]:
             return None
         resting = self.reference.resting
@@ -299,7 +300,7 @@ class ArmController:
 
     @property
     def streaming(self):
-        """How points of streams are taken, for `validate`. Any thread may ask."""
+        """How `validate` takes the points of streams. Any thread may ask."""
         settings, deceleration = self.supervisor.settings, self.supervisor.deceleration
         gentle = np.minimum(GENTLE, deceleration)
         return Streaming(
@@ -317,10 +318,10 @@ class ArmController:
         return self.law.feedforward is not None and self.law.feedforward.plans
 
     def prepare(self, trajectory):
-        """Do the design work for a `trajectory` before `offer`, which takes the result; off the control path.
+        """Do the design work for a `trajectory`, off the control path; give the result to `offer`.
 
-        Returns None if there is nothing to prepare. Raises a `DesignError` if it can't be done; then offer the
-        trajectory without it.
+        Returns None if there is nothing to prepare. Raises a `DesignError` if the work can't be done; then offer the
+        trajectory without a plan.
         """
         start = self.reference.resting
         if start is None or not self.plans:
@@ -339,11 +340,11 @@ class ArmController:
         refuse_torque(self.model, trajectory, start, self.torque_allowed)
 
     def offer(self, trajectory, plan=None, judged=False, name=""):
-        """Offer a `trajectory`, with the `plan` that `prepare` made for it; `reason` keeps a refusal.
+        """Offer a `trajectory`, with the `plan` that `prepare` made for it; after a refusal, `reason` says why.
 
-        The attribute `judged` then has its `name`.
+        After the call the attribute `judged` has the `name` of this trajectory.
 
-        The torque that it needs is checked here, which takes a while, unless the argument `judged` is true.
+        The torque that it needs is checked here, unless the argument `judged` is true. The check takes a while.
 
         A trajectory may also be offered while the observer converges. With stamp 0 it then starts with the first
         torque; if its explicit start passes before that, it is given up.
@@ -388,11 +389,11 @@ class ArmController:
         Returns
         -------
         bool or None
-            `enabled`; None for a sample that came after a later one, since it has had its answer or needs none. A
+            `enabled`; None for a sample that came after a later one: it has been answered, or needs no answer. A
             repeated (session, sequence) is answered as before.
         """
         if not self.model.n_modes:
-            sample.amplitude = sample.rate = self._nothing  # on a topic none and unknown look alike
+            sample.amplitude = sample.rate = self._nothing  # read as unknown, but there are none
         try:
             verdict = self._judge(sample, now_ns)
         except MessageError as error:
@@ -477,7 +478,7 @@ class ArmController:
         return self.enabled
 
     def _expect(self, path):
-        """Note the path that is followed, or None; if its torque was checked, its accelerations can brake the arm."""
+        """Note the followed path, or None. If its torque was checked, the arm can also brake with its accelerations."""
         self._expected = path
         most = np.zeros(self.model.n_joints)
         if path is not None and np.isfinite(self.torque_allowed).all():
@@ -529,7 +530,7 @@ class ArmController:
         return True
 
     def recover(self):
-        """Leave a fault, and return whether there was one; the next valid state gives torque, from where the arm is."""
+        """Leave a fault, and return whether there was one; torque begins where the arm is, at the next valid state."""
         self._foreign = self._repeats = 0
         return self.supervisor.recover()
 
@@ -550,7 +551,7 @@ class ArmController:
         self._off()
 
     def disable(self, reason):
-        """Give no torque until a valid state comes, without a fault: the node ends, or waits for its observer."""
+        """Give no torque until a valid state comes, but no fault: for a node that ends or waits for its observer."""
         self.supervisor.wait(reason)
         self._off()
 
@@ -561,7 +562,7 @@ class ArmController:
     # Samples -------------------------------------------------------------------------------------
 
     def _judge(self, sample, now_ns):
-        """Class of the sample, which counts as the last one from now on; raises an error if it can't be used."""
+        """Class of the sample, which becomes the last one; raises an error if the sample can't be used."""
         order = self._order
         verdict = order.judge(sample)
         if verdict == SampleOrder.STALE:
@@ -574,9 +575,9 @@ class ArmController:
         since_ns = sample.stamp_ns - order.stamp_ns
         missed = max(sample.sequence - order.sequence - 1, 0)
         if verdict != SampleOrder.REPEAT:
-            order.take(sample)  # a bad one, too: the next one is compared with it
+            order.take(sample)  # even a bad one: the next one is compared with it
         if verdict == SampleOrder.RESTART:
-            self._applied.forget()  # in a fault, too: the driver may not have found this controller yet
+            self._applied.forget()  # even in a fault: the driver may not have found this controller yet
         if verdict == SampleOrder.JUMP:
             raise _refused_stamp(
                 -since_ns, "s before the last state, so the source's clock went back"
@@ -605,7 +606,7 @@ class ArmController:
             raise _refused_stamp(abs(age), f"s {when} is beyond max_age", self._max_age, hint)
 
     def _lacks(self, sample, verdict):
-        """What torque needs and is not known yet; empty if everything is known."""
+        """What is not known yet, but needed for torque; empty if everything is known."""
         if sample.amplitude is None:
             return "modal_amplitude is not known yet"
         if sample.rate is None and self.law.needs_rates:
@@ -632,7 +633,7 @@ class ArmController:
             self._seen = [self._seen[-1], (sample.stamp_ns, sample.position.copy())]
 
     def _begin(self, sample, verdict):
-        """Begin with the first torque of a session, or after a time without torque, from the present position."""
+        """Begin with torque from the present position, in a new session or after a time without torque."""
         keeps = self._waiting and verdict != SampleOrder.RESTART and self.reference.pending
         if keeps and (given_up := self._left_behind(sample)):
             self._trajectory_reason = given_up
@@ -663,16 +664,16 @@ class ArmController:
         self._jumped_ns = 0
         try:
             self.reference.start(position, stamp, velocity, deceleration)
-        except TrajectoryError:  # it moves too fast to be braked: the supervisor's limits end that
+        except TrajectoryError:  # it moves too fast to be braked: the supervisor's limits stop it
             self.reference.start(position, stamp)
 
     def _rest_on(self, position, stamp_ns):
-        """Let the reference hold a position (n,) [rad], by the source's clock as it is at a stamp [ns]."""
+        """Let the reference hold a position (n,) [rad] from a stamp [ns] on; it follows the source's clock again."""
         self._jumped_ns = 0
         self.reference.start(position.copy(), stamp_ns)
 
     def _seen_for(self, sample, verdict):
-        """Time for which positions have been seen while the controller waited, `SEEN` or a little more [s]."""
+        """Time since the earliest position that is stored while the controller waits [s]."""
         waiting = self._waiting and verdict != SampleOrder.RESTART
         return 1e-9 * (sample.stamp_ns - self._seen[0][0]) if waiting else 0.0
 
@@ -688,8 +689,8 @@ class ArmController:
     def _after_gap(self, sample, gap, period):
         """Time that counts as passed in a gap between two stamps [s]; 0 if torque was lost.
 
-        If the joints show that the source's clock jumped, the reference goes on by its own time, and the arm comes to
-        rest on its path.
+        If the joints show that the source's clock jumped, the reference continues in its own time, and brings the arm
+        to rest on its path.
         """
         by_number = period * self._count
         if not gap > PERIODS_OF_GAP * by_number > 0.0:
@@ -705,7 +706,7 @@ class ArmController:
         return by_number
 
     def _restarted(self, sample):
-        """Why a new session of the source is a fault; empty for an arm that rests where it was."""
+        """Why a new session of the source is a fault; empty if the arm rests where it was."""
         reference, names = self.reference, self.model.joint_names
         if reference.active or reference.pending or reference.stopping:
             return "the source of the states has restarted during a motion: is its zero the same?"
@@ -722,7 +723,7 @@ class ArmController:
         return ""
 
     def _may_go_on(self, sample):
-        """Whether a repeated state may give torque again; one that is repeated too often, or changed, is a fault."""
+        """Whether a repeated state may give torque again; distrusts one repeated too often or with another stamp."""
         if not (self.enabled or self._waiting):
             if sample.stamp_ns != self._order.stamp_ns:
                 self.distrust(f"state {sample.sequence} came again with another stamp")
@@ -750,8 +751,8 @@ class ArmController:
 def _steady_velocity(sample, stamp_ns, position):
     """Joint velocities without noise and swings, (n,) [rad/s]: no faster than the mean since an earlier sample.
 
-    An estimate that has just begun, or does not know of a safe action, has velocities with which the arm does not go
-    anywhere. So have light joints, which bent links turn to and fro.
+    An estimated velocity may not move the arm anywhere: the observer has just begun, or does not know that the safe
+    action acts. Nor does the velocity of light joints, which bent links turn to and fro.
     """
     time = 1e-9 * (sample.stamp_ns - stamp_ns)
     mean = (sample.position - position) / max(time, 1e-9)

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Bounds the law's torque before it is sent: its size, its rate of change, and the ramp in which it returns.
 
-After any time without torque, the law's torque u comes back about the torque u_g that holds the arm's weight in its
-present position,
+After any time without torque, the law's torque u returns in a ramp. The ramp starts from u_g, the torque that holds the
+arm's weight in its position at that time,
 
 .. math:: u_{sent} = u_g + a(t)\,(u - u_g), \qquad a = \min(1, (t/T)^2),
 
-so that torque and stiffness grow together. u - u_g is bounded by the torque limit. With T = `return_time` of 65 ms, a
-is below a tenth for the first 20 ms. Without gravity u_g is zero. If the arm rests and u begins within `SMALL` of u_g,
-there is no ramp.
+so that torque and stiffness grow together. In the ramp, u - u_g is bounded by the torque limit. With T = `return_time`
+of 65 ms, a is below a tenth for the first 20 ms. Without gravity u_g is zero. If the arm rests and u begins within
+`SMALL` of u_g, there is no ramp.
 
-The rate is always bounded. Lost samples do not raise the change that the next one may make, since an estimate is at its
-worst after them. If the arm file gives no limit of the rate, its budget is :math:`8\,\omega_1` times the torque limit
-per second, with omega_1 the lowest bending frequency with the joints locked: a torque that swings between its limits
-eight times as fast as the softest mode. A motion needs a hundredth of it.
+The rate is bounded in the ramp and after it. After lost samples the torque may change no more than in one period,
+because an estimate is at its worst then. If the arm file gives no limit of the rate, the limit is
+:math:`8\,\omega_1` times the torque limit per second, with omega_1 the lowest bending frequency with the joints locked.
+This is the rate of a torque that swings between its limits eight times as fast as the softest mode. A motion needs a
+hundredth of it.
 """
 
 import numpy as np
@@ -25,11 +26,11 @@ from flexarm_dynamics.singular_perturbation import slow_torque
 from .. import kernels
 from ..arrays import clip
 
-#: Fraction of the torque limit; an arm whose torque begins with a smaller change needs no ramp.
+#: An arm at rest whose torque begins within this fraction of the torque limit from u_g needs no ramp [-].
 SMALL = 0.02
-#: Rate limit that means none [N m/s].
+#: This rate limit, or a larger one, means that there is none [N m/s].
 NO_RATE = 1e9
-#: Rate budget of an arm whose file gives none, over its torque limit and lowest bending frequency.
+#: Rate limit if the arm file gives none, divided by torque limit and lowest bending frequency [-].
 BUDGET = 8.0
 
 PARAMETERS = (
@@ -47,7 +48,7 @@ PARAMETERS = (
 
 
 def torque_rates(model):
-    """Largest rate of each joint's torque, (n,) [N m/s]: the arm file's, or the budget; infinite without either."""
+    """Largest rate of each joint's torque, (n,) [N m/s]: the arm file's, else `BUDGET`'s; infinite without both."""
     arm = model.arm
     stated = arm.torque_rates
     if not np.isinf(stated).any() or not model.n_modes:
@@ -57,7 +58,7 @@ def torque_rates(model):
 
 
 class Authority:
-    """Torque within its limits of size and rate, which returns in a ramp; see the module.
+    """Keeps the torque within its limits of size and rate, and lets it return in a ramp; see the module.
 
     Parameters
     ----------
@@ -103,7 +104,7 @@ class Authority:
         return self._elapsed >= self._time
 
     def begin(self, q, rests):
-        """Let torque return to an arm at q (n,) [rad] that `rests` or not, beginning with the torque for its weight."""
+        """Begin the ramp at q (n,) [rad] with the torque that holds the weight; `rests`: whether the arm is at rest."""
         self._elapsed, self._first = 0.0, rests
         self._weight[:] = self._holding(q)
         clip(self._weight, -self.limit, self.limit)
@@ -122,7 +123,7 @@ class Authority:
         self.torque[:] = 0.0
 
     def send(self, u, dt, period):
-        """Set `torque` to what may be sent of a torque u (n,) [N m].
+        """Set `torque` to the law's torque u (n,) [N m], within its limits.
 
         Parameters
         ----------
@@ -131,7 +132,7 @@ class Authority:
         dt : float
             Time since the last torque [s].
         period : float
-            Part of `dt` that counts for the torque's rate: without lost samples [s].
+            Time that counts for the rate limit: `dt` without the time of lost samples [s].
 
         Returns
         -------
@@ -143,8 +144,10 @@ class Authority:
             self._first = False
             if (np.abs(u - self._weight) <= self._small).all():
                 self._elapsed = np.inf
-                np.copyto(torque, u)
-                return False
+                np.clip(
+                    u, -self.limit, self.limit, out=torque
+                )  # the rest may take nearly all of it
+                return bool((torque != u).any())
         if self._elapsed < self._time:
             self._elapsed += dt
             part = min(1.0, (self._elapsed / self._time) ** 2)

@@ -28,13 +28,14 @@ class ArmSample:
     velocity_known : bool
         False if the source gave no joint velocity.
     controller_id : int
-        Id of the controller whose answer to this state acts; 0: none, or unknown.
+        Id of the controller whose answer to this state the driver applies; 0: none, or unknown.
     trust : int
         `TRUSTED`; `STOP`: only to be used to bring the arm to rest; `DISTRUSTED`: not to be used.
     doubt : str
         Which sensor is in doubt, and why; empty if none is.
     clock_stopped : bool
-        Whether the source's clock stands still until it is answered or goes on; it sends the same sample again.
+        Whether the source's clock stands still until an answer comes or the clock goes on; meanwhile the source sends
+        the same sample again.
     """
 
     #: Values as in ArmState.
@@ -74,7 +75,7 @@ class ArmSample:
         return self.session, self.sequence
 
     def check(self, model):
-        """Refuse values that are not finite or beyond any arm's; unknown values are not checked.
+        """Refuse values that are not finite, or too large for any arm; unknown values are not checked.
 
         Raises
         ------
@@ -103,15 +104,16 @@ class ArmSample:
 WRAP = 2**32
 
 
-#: A clock has jumped if the error of the positions by the numbers is below this fraction of that by the stamps [-].
+#: The positions are predicted with the time by the numbers and by the stamps. The clock has jumped if the error of the
+#: first is below this fraction of the error of the second [-].
 JUMP_FITS = 0.25
 
 
 def clock_jumped(moved, velocity, by_number, by_stamp):
-    """Whether a stamp too late for its number means that the clock jumped, and not that the source stood still.
+    """Whether the clock jumped, rather than the source stood still, if a stamp is too late for its number.
 
-    The positions show which: whether the joints have moved as far as in the one time or in the other. Joints at rest
-    show neither; the result is then False.
+    The positions show which of the two times has passed: the joints have moved by about velocity times that time.
+    Joints at rest show neither; the result is then False.
 
     Parameters
     ----------
@@ -133,7 +135,7 @@ class SampleOrder:
     """
 
     NEW, REPEAT, RESTART, STALE, JUMP, FOREIGN = range(6)
-    #: After this many FOREIGN or STALE samples without others, their session or number is followed again.
+    #: After this many FOREIGN or STALE samples in a row, the order continues from their session and number.
     ALONE = 200
 
     def __init__(self):

@@ -15,10 +15,11 @@ The arm is stopped smoothly when a limit is exceeded, that is, when one of these
 .. math:: |q_r - q|/e_{max},\; |\dot q|/\dot q_{max},\; |\delta|/\delta_{max},\; |\varepsilon|/\varepsilon_{max},\;
           t_{saturated}/t_{max}
 
-The range of the joints is checked with braking distance, by :math:`q + \dot q|\dot q|/2D`. D is the deceleration that
-the torque limit of the joint allows a straight arm, or the largest acceleration of the followed motion, if that is
-larger: its torque was checked on receipt, with the other joints' torques and in its own configurations. While a joint
-follows a motion that brakes, :math:`\dot q_r^2 \le 2D|q_{end} - q_r|`, so a motion within the range is not stopped.
+The range of the joints is checked with the braking distance, by :math:`q + \dot q|\dot q|/2D`. D is the deceleration
+that the joint's torque limit allows a straight arm. If the largest acceleration of the followed motion is larger, D is
+that: the motion's torque was checked on receipt, in its own configurations and with the torques of the other joints.
+While a joint follows a motion that brakes, :math:`\dot q_r^2 \le 2D|q_{end} - q_r|`. So a motion within the range is
+not stopped.
 
 A ratio above `FAULT_RATIO` is a fault, and so is a limit that stays exceeded for `limit_patience`, or a state that
 can't be trusted.
@@ -116,7 +117,8 @@ class Supervisor:
     stops, faults : int
         Numbers of stops and faults so far.
     deceleration : ndarray, shape (n,)
-        Deceleration of a smooth stop [rad/s^2]: the parameter, or half of what the torque limit allows.
+        Deceleration of a smooth stop [rad/s^2]: the parameter, or half of what the torque limit allows, or
+        `FREE_DECELERATION` without a torque limit.
     deceleration_given : ndarray, shape (n,), bool
         Whether the parameter gives it.
 
@@ -237,7 +239,7 @@ class Supervisor:
         return True
 
     def begin(self):
-        """Begin with torque: there are a valid state and a converged observer."""
+        """Begin with torque, since there are a valid state and a converged observer."""
         self.state, self.reason = State.READY, ""
         self.forget()
 
@@ -269,7 +271,7 @@ class Supervisor:
         amplitude : ndarray, shape (m,)
             [m, rad]
         error : ndarray, shape (n,) or None
-            Reference minus position [rad]; None if no law holds the joints to it.
+            Reference minus position [rad]; None if the law does not make the joints follow it.
         saturated : bool
             Whether a torque was at its limit.
         dt : float
@@ -321,7 +323,7 @@ def _deceleration(model, torque_limit):
     n = model.n_joints
     a, B = slow_subsystem(model.terms(np.zeros(n), np.zeros(n)))
     most = np.diag(B) * torque_limit
-    # Gravity takes some of it; at least a fifth is left.
+    # Gravity takes some of it; assume that at least a fifth is left.
     return np.maximum(most - np.abs(a), 0.2 * most)
 
 

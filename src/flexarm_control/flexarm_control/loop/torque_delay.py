@@ -7,7 +7,7 @@ until the next one acts, and a delay of (k + f) periods, 0 <= f < 1, it reports 
 .. math:: r_{j+1} = (1 - f)\,u_{j-k} + f\,u_{j-k-1} .
 
 Over a block of samples, f follows for each k by least squares, and the k with the smallest residual is the delay. A
-lost state has no answer, so the torque before it goes on. A torque that hardly changes does not show the delay, nor
+lost state has no answer, so the torque before it goes on. A torque that hardly changes does not show the delay. Nor
 does one that fits no k. If a driver reports the torque at the stamp, and not the mean before it, the delay looks
 shorter by up to a period.
 """
@@ -16,11 +16,12 @@ import numpy as np
 
 #: Longest delay that is considered, in periods; samples in a block; and periods that are remembered.
 LAGS, BLOCK, SENT = 32, 16, 128
-#: Largest residual, over the change of the torque from sample to sample, both as sums of squares [-].
+#: A k fits if its residual is at most this fraction of the torque's change from sample to sample, both as sums of
+#: squares [-].
 FITS = 0.5
-#: Smallest change of the torque from sample to sample, over its size [-].
+#: Smallest change of the torque from sample to sample that shows a delay, as a fraction of the torque's size [-].
 CHANGES = 1e-8
-#: Periods that differ by more than this fraction do not belong to one block [-].
+#: A period that differs from the last one by more than this fraction begins a new block [-].
 SAME = 0.2
 
 

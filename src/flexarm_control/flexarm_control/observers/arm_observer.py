@@ -17,7 +17,7 @@ from .plausibility import monitor
 
 OBSERVERS = "flexarm.observers"
 
-#: Parameters of the observer that belong to no single law.
+#: Parameters that all observers share.
 PARAMETERS = (
     parameter("joint_velocity_bandwidth", 500.0, "rad/s", 1.0, 1e6).described(
         "Corner of the filtered derivative of the joint positions, for a source without joint velocities."
@@ -37,7 +37,7 @@ PARAMETERS = (
 
 
 def design_observer(name, model, values):
-    """As `component.make`, for an observer by its `name`."""
+    """Make the observer with this `name`, see `component.make`."""
     return make(OBSERVERS, name, model, values, "observer.")
 
 
@@ -57,11 +57,11 @@ def observe(model, name, values):
 class ArmObserver:
     r"""Estimates modal amplitudes and rates, sample by sample.
 
-    If the source does not report joint velocities, or these are not to be used, the observer's estimate takes their
-    place or, if it makes none, the filtered derivative of the positions.
+    If the source does not report joint velocities, or the settings say not to use them, the observer's estimate takes
+    their place. If the observer makes none, the filtered derivative of the positions does.
 
-    With a `delay`, the estimate is the state at the stamp plus the delay, after the model's motion (`motion`) under the
-    constant reported torque. Torques sent since then are unknown here.
+    With a `delay`, the estimate is the state at the stamp plus the delay. It is predicted by `motion`, under the
+    reported torque, which is held constant. Torques sent since then are unknown here.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ class ArmObserver:
             `trust` and `doubt` are set: see `plausibility.monitor`. Errors that only show over several samples are
             reported with the next one.
         later : bool
-            Leave those to `look_ahead`, which must then be called before the next sample, with this one unchanged.
+            Leave the search for those errors to `look_ahead`. Call it before the next sample, with this one unchanged.
 
         Returns
         -------
@@ -148,7 +148,7 @@ class ArmObserver:
         """
         last_stamp = self._order.stamp_ns
         if sample.amplitude is None and not self.model.n_modes:
-            sample.amplitude = self._nothing  # on a topic no amplitudes and unknown ones look alike
+            sample.amplitude = self._nothing  # read as unknown, but there are none
         self._check(sample)
         verdict = self._order.judge(sample)
         if verdict == SampleOrder.REPEAT:
@@ -184,7 +184,7 @@ class ArmObserver:
                 if sample.velocity_known:
                     sample.velocity[:] = self._sent
             self._derivative[:] = self._derived
-        # Only now, so that a refused sample leaves nothing behind, not even its time step.
+        # This comes last, so that a refused sample changes nothing, not even the time step.
         if judges:
             self.monitor.mark(sample)
             self._taken = sample
@@ -202,7 +202,7 @@ class ArmObserver:
         self.observer.look_ahead()
 
     def _take(self):
-        """Have the last sample remembered, if it was judged."""
+        """Let the monitor remember the last sample, if it judged it."""
         sample, self._taken = self._taken, None
         if sample is not None:
             self.monitor.take(sample)
@@ -212,16 +212,17 @@ class ArmObserver:
         return self.settings["plausibility"]
 
     def _judge(self, sample, dt):
-        """Have the readings of a new sample judged; returns whether the observer has to start again."""
+        """Let the monitor judge the readings of a new sample; returns whether the observer has to start again."""
         order = self._order
-        if self.monitor.stamp_ns != order.stamp_ns:  # it was off until now
+        if self.monitor.stamp_ns != order.stamp_ns:  # the monitor was off until now
             dt = 0.0
         return self.monitor.judge(sample, dt, (sample.sequence - order.sequence) % WRAP)
 
     def _step_of(self, sample):
         """Time since the last sample [s], by the stamps, or by the numbers if the source's clock has jumped.
 
-        Over a jump the old estimate goes on. During a pause of the source the torque is unknown.
+        After a jump the estimate goes on as if no time had been lost. After a pause of the source it is predicted over
+        the pause, although the torque in it is unknown.
         """
         order = self._order
         dt = 1e-9 * (sample.stamp_ns - order.stamp_ns)
@@ -268,9 +269,9 @@ class ArmObserver:
                 )
 
     def calibrate(self):
-        """Set the gauges' bias from the last samples, which are of an arm at rest; not on the control path.
+        """Set the gauges' bias from the last samples, which must be of an arm at rest; not on the control path.
 
-        The estimate moves with the bias, so that its rates don't jump.
+        The estimate changes with the bias, so that its rates don't jump.
 
         Returns
         -------
@@ -328,7 +329,7 @@ class ArmObserver:
         try:
             self.observer.update(sample, dt)
         except MessageError as error:
-            # The monitor may have taken out what the observer lacks.
+            # The monitor may have taken out the reading that the observer needs.
             doubt = self.monitor.doubts.text if self._judges else ""
             if doubt:
                 raise MessageError(f"{doubt}; {error}") from error
@@ -347,7 +348,7 @@ class ArmObserver:
         if sample.amplitude is None and self.strain_map is None:
             problem = f"can't be mapped: the arm file of {self.model.arm.name} has no gauges"
             raise MessageError(problem, field="strain")
-        if self._kernels.is_beyond(sample.torque, MAX_TORQUE):  # NaN, which means unknown, is not
+        if self._kernels.is_beyond(sample.torque, MAX_TORQUE):  # NaN means unknown, and passes
             i = int(np.argmax(np.abs(sample.torque) >= MAX_TORQUE))
             raise MessageError(
                 "is beyond any arm's torque",
@@ -365,9 +366,9 @@ class ArmObserver:
         return difference + (self._derivative - difference) * np.exp(-bandwidth * dt)
 
 
-#: Samples of a warm-up, and the time between them [ns]; together they take longer than a strain filter to settle.
+#: Samples of a warm-up, and the time between them [ns]; together they exceed a strain filter's settling time.
 WARM_UP, WARM_UP_NS = 250, 4_000_000
-#: A step by the stamps that is this many times as long as by the numbers may be a jump of the clock [-].
+#: If the step by the stamps is more than this many times as long as by the numbers, the clock may have jumped [-].
 JUMP_PERIODS = 20.0
 #: After a longer silence an observer starts again [ns].
 MAX_GAP_NS = 500_000_000

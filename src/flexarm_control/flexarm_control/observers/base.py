@@ -80,7 +80,7 @@ class Observer(Component, ABC):
         self.amplitude[:] = amplitude
 
     def look_ahead(self):
-        """Compute ahead, between two samples, for the next one; changes no result."""
+        """Do work for the next sample in advance, between two samples; changes no result."""
 
     @abstractmethod
     def update(self, sample, dt):
@@ -96,7 +96,7 @@ class Observer(Component, ABC):
 
 
 def need_torque(torque, what, hint):
-    """Refuse a sample without torque, (n,), because `what` predicts with it."""
+    """Refuse a sample whose `torque` (n,) is unknown, because `what` predicts with it."""
     if not finite(torque):
         raise MessageError(
             f"is unknown (NaN), and {what} predicts with it",

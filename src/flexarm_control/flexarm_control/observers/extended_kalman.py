@@ -8,9 +8,9 @@ The state of `kalman` is augmented by parameters, each a slow random walk:
     \theta = (s,\ b_1 \ldots b_n,\ c_1 \ldots c_n)
 
 where s is the scale of the payload's mass and inertia. Each joint has the friction torque
-:math:`b_i\dot q_i + c_i\tanh(\dot q_i/\epsilon_i)` instead of the arm file's. Mass matrix and forces
-are affine in s. Therefore, with :math:`M_1, a_1` of the arm file's arm and :math:`M_2, a_2` of the arm with twice
-the payload (same mode shapes), the acceleration is exactly
+:math:`b_i\dot q_i + c_i\tanh(\dot q_i/\epsilon_i)` instead of the arm file's. Mass matrix and forces are affine in s.
+Let :math:`M_1, a_1` be mass matrix and acceleration of the arm file's arm, and :math:`M_2, a_2` those of the arm with
+twice the payload (same mode shapes). Then the acceleration is exactly
 
 .. math:: a = [(2 - s)M_1 + (s - 1)M_2]^{-1}[(2 - s)M_1a_1 + (s - 1)M_2a_2] .
 
@@ -139,7 +139,7 @@ class ExtendedKalman(Kalman):
         viscous = theta[self._at["viscous"]] if "viscous" in self._at else viscous
         coulomb = theta[self._at["coulomb"]] if "coulomb" in self._at else coulomb
         friction = viscous * speed + coulomb * np.tanh(speed / smoothing)
-        net = torque + model.friction(speed) - friction  # the model subtracts its own
+        net = torque + model.friction(speed) - friction  # the model subtracts its own friction
         out = np.zeros(x.size)
         out[:N] = model.derivative(x[:N], net)
         if self._heavier is not None:
@@ -159,7 +159,7 @@ class ExtendedKalman(Kalman):
         return self.state + design.Gamma @ self.derivative(self.state, torque), design
 
     def _foresee(self):
-        """Do nothing, since the parameters move with the state."""
+        """Do nothing: `_predict` computes the whole step, with the estimated parameters."""
 
     def _linearised(self, torque, dt):
         """The step, linearised at the estimate under this torque."""
@@ -172,7 +172,7 @@ class ExtendedKalman(Kalman):
 
 
 def _twice_loaded(model):
-    """The arm with twice its payload and the same mode shapes: the equations of motion are affine in it."""
+    """The arm with twice its payload and the same mode shapes; the equations of motion are affine in the payload."""
     payload = model.arm.payload
     if not payload.mass > 0.0:
         raise DesignError(

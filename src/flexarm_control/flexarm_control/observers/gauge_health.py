@@ -5,17 +5,17 @@ A reading :math:`\varepsilon_i` of gauge i is
 
 - missing when it is not finite,
 - saturated when it is at an end of the bridge's range,
-- stuck when it has been the same to the last bit for `stuck_samples` samples, while the others of its link and
-  direction (two of them, if there are two) moved so far that it must have moved too: by more than 8 of its
-  resolutions, even in the mode that strains it least relative to the others,
+- stuck when it has been the same to the last bit for `stuck_samples` samples, while another gauge of its link and
+  direction (two others, if there are two) moved so far that it must have moved too. Even in the mode that strains it
+  least relative to the other gauge, it must have moved by more than 8 of its resolutions,
 - suspect when it does not fit the others: with more gauges than modes, the residual
   :math:`r = \varepsilon - b - R\hat\delta` of weighted least squares has the variance
   :math:`\sigma_i^2(1-H_{ii})`, with :math:`H = R(R^TWR)^{-1}R^TW`; the mean square of
   :math:`r_i/(\sigma_i\sqrt{1-H_{ii}})` is one for a good gauge, and largest for the wrong gauge.
 
 Missing, saturated and stuck gauges are left out of the strain map if the others still give every observed mode.
-Otherwise the sample is refused, since fewer gauges than modes give no amplitudes. A suspect gauge is reported but
-still used: unobserved modes cause residuals too.
+Otherwise the sample is refused, since fewer gauges than modes give no amplitudes. A gauge with a suspect residual is
+reported but still used: unobserved modes cause residuals too.
 
 The bias of a gauge on an arm at rest is what it reads beyond the strain of the arm's own weight,
 
@@ -54,7 +54,7 @@ def resolution(gauges):
 
 
 def min_travel(rows, gauges):
-    """Least strain of gauge i per strain of gauge j, over the modes that strain both, shape (gauges, gauges).
+    """Smallest strain of gauge i per strain of gauge j, over the modes that strain both, shape (gauges, gauges).
 
     It is zero for gauges of different links or directions, and on the diagonal. `rows` are the strain map's.
     """
@@ -205,7 +205,7 @@ class GaugeHealth:
     def amplitudes(self, strain, out=None):
         """Modal amplitudes from the usable gauges, shape (modes,) [m, rad]; `strain` and `out` as in `StrainMap`.
 
-        A `MessageError` names gauges and modes if the usable ones don't give all observed modes.
+        If the usable gauges don't give all observed modes, a `MessageError` names the others and the missing modes.
         """
         self.lost = self._left_out(strain) if self._holding else ()
         return self.strain_map.amplitudes_without(self.lost, strain, out)

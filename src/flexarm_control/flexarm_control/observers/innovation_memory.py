@@ -2,7 +2,7 @@
 r"""Predicts a filter's next innovation from its past ones.
 
 A Kalman filter with the right model leaves white innovations. Vibration that its model lacks, and noise of another
-colour than it assumes, come back in them after some samples. A noise model in series with the filter,
+colour than it assumes, make successive innovations correlated. A noise model in series with the filter,
 
 .. math::
     \hat\nu_k = \sum_{l=1}^{L} A_l\,\nu_{k-l},

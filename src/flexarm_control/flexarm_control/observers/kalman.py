@@ -77,7 +77,7 @@ class Kalman(Observer):
     PARAMETERS = NOISE
     NAME = "kalman"
 
-    #: Deviation of the first sample's rates from zero [rad/s, m/s].
+    #: Assumed rms error of the rates at the first sample [rad/s, m/s].
     START = 1.0
     #: The estimate has converged once no rate's variance falls by more than this fraction per sample.
     SETTLED = 0.1
@@ -93,7 +93,7 @@ class Kalman(Observer):
         self.innovation = np.zeros(m)
         self.covariance_diagonal = np.zeros(2 * m)
         self.joint_position, self.joint_velocity = np.zeros(n), np.zeros(n)
-        # Torque and period of the last sample, which the next one is assumed to have, too.
+        # Torque and period of the last sample; the next one is assumed to have the same.
         self._torque, self._period = np.zeros(n), 0.0
         self._assume()
         self.state, self.covariance = np.zeros(2 * self._p), np.zeros((2 * self._p,) * 2)
@@ -218,7 +218,7 @@ class Kalman(Observer):
         self._foresee()
         if not self.converged or self._steady:
             return
-        with suppress(MessageError):  # the sample itself raises it, if it comes so
+        with suppress(MessageError):  # if the sample comes as assumed, it raises this error itself
             self._ahead = step, self.measurement_covariance, self._corrected(step)
 
     def _recursion(self, step):
@@ -233,7 +233,7 @@ class Kalman(Observer):
         self.covariance[:] = P
 
     def _corrected(self, step):
-        """After a step and a measurement: covariance, root of the innovation's, K^T, and whether the variances stay."""
+        """Covariance after a step and a measurement, root of the innovation's, K^T, and whether variances settled."""
         R = self.measurement_covariance
         P = step.Phi @ self.covariance @ step.Phi.T
         P += step.Q

@@ -13,14 +13,14 @@ gravity's curvature) are held over the step. Forces of spectral density S on joi
 
 .. math:: Q = \int_0^h e^{As}\,B S B^T e^{A^Ts}ds, \qquad B = \begin{bmatrix}0\\ M^{-1}\end{bmatrix}
 
-to the covariance (Van Loan 1978). A and B are taken at the straight arm at rest, with viscous friction only: the
-gradient of Coulomb friction at rest is wrong for a moving joint.
+to the covariance (Van Loan 1978). A and B are taken at rest with undeflected links, and with viscous friction only:
+the gradient of Coulomb friction at rest is wrong for a moving joint.
 
-Designs are made per time step rounded to 10 us and configuration rounded to 0.1 rad, so that they do not depend on
+A design belongs to a time step rounded to 10 us and a configuration rounded to 0.1 rad, so that it does not depend on
 the past. The rest of the time step, at most 5 us, is corrected to second order of the linear motion. Linearisations
-are kept per configuration. With one, a new time step takes only a short series and some products
-(`flexarm_dynamics.sampling`), no matrix exponential. This matters because a source's stamps may jitter, its samples may
-get lost, and an arm that moves reaches a new configuration now and then.
+are kept per configuration. If there is one, a new time step takes only a short series and some products
+(`flexarm_dynamics.sampling`), no matrix exponential. This matters because stamps may jitter, samples may get lost, and
+a moving arm reaches a new configuration now and then.
 """
 
 from dataclasses import dataclass
@@ -57,11 +57,11 @@ class Foreseen:
 
     period: float  # that the step was designed for [s]
     step: Step
-    torque: np.ndarray  # that is expected, (n,) [N m]
+    torque: np.ndarray  # expected, (n,) [N m]
     state: np.ndarray  # after the step under that torque, (N,)
     rate: np.ndarray  # f under that torque, (N,)
     push: np.ndarray  # change of the accelerations with the torque, (n + m, n)
-    moved: np.ndarray  # and of the state after the step, (N, n)
+    moved: np.ndarray  # change of the state after the step with the torque, (N, n)
 
 
 class Motion:
@@ -125,7 +125,7 @@ class Motion:
 
 
 def _with_rest(out, rate, dt, step):
-    """The result `out` of `step`, corrected for the rest of the time dt [s]; `rate` is f before the step."""
+    """The result `out` of `step`, corrected for the rest of the time step dt [s]; `rate` is f before the step."""
     rest = dt - step.length
     if abs(rest) > EXACT:
         rate = step.Phi @ rate  # after the step

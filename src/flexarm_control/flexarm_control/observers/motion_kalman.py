@@ -23,8 +23,8 @@ is left out.
 Past innovations can predict the next one (``innovation_order``, `innovation_memory`). This improves predicted strains,
 and leaves the state as it is.
 
-A bias and a slow deflection differ only in how the motion affects them. At rest the filter can't distinguish them
-beyond ``bias_deviation``.
+The filter can tell a bias from a slow deflection only while the arm moves. At rest it knows no more of the bias than
+``bias_deviation`` says.
 """
 
 from dataclasses import replace
@@ -57,7 +57,7 @@ class MotionKalman(Kalman):
     strain_innovation : ndarray, shape (g,)
         Measured minus predicted strain; NaN for a gauge that is left out.
     strain_error : ndarray, shape (g,)
-        The same, minus the prediction from past innovations.
+        `strain_innovation` minus its prediction from past innovations.
     memory : InnovationMemory
     parameters_estimated : dict
         Bias of each gauge beyond the arm file's.
@@ -102,7 +102,7 @@ class MotionKalman(Kalman):
         super().__init__(model, parameters)
 
     def _assume(self):
-        """Do nothing, since `_prepare` sets the noise, with the state that it acts on."""
+        """Do nothing: `_prepare` sets the noise, together with the state."""
 
     def _prepare(self):
         model, values = self.model, self.parameters
@@ -223,7 +223,7 @@ class MotionKalman(Kalman):
         return self.motion.advance(self.state, torque, dt, step), step
 
     def _foresee(self):
-        """Do nothing, since no torque is needed."""
+        """Do nothing: the prediction needs no torque, and `_predict` makes it as a whole."""
 
     def _output(self, x):
         return self._C @ x

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs for arms that are not quite what their file says: gains, optimised over a set of sampled loops."""
+"""Designs for arms that differ from their arm file: gains that are optimised over a set of sampled loops."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs that were made before, one file each in the cache directory, beside the compiled kernels.
+"""Cache of designs: one file for each design, in the cache directory beside the compiled kernels.
 
-A file is named by all that its design depends on: arm, `Settings`, `Uncertainty` and the source code that designs. What
-is not readable, was cut short, or belongs to something else is as good as absent, and written anew.
+A file's name is a hash of all that its design depends on: arm, `Settings`, `Uncertainty` and the source code of the
+design. A file that is unreadable, truncated or made for another design counts as absent, and is written again.
 """
 
 import hashlib
@@ -16,15 +16,15 @@ from pathlib import Path
 import flexarm_dynamics
 from flexarm_dynamics.kernels.load import cache_directory
 
-#: Fields of an arm that change no design.
+#: Fields of an arm on which no design depends.
 WORDS = ("name", "description", "source")
-#: Modules beside this package that a design's gains follow from.
+#: Modules outside this package on which a design's gains depend.
 TAKEN = ("fading.py", "low_pass.py", "schedule.py")
 
 
 @once
 def version():
-    """Hash of the source code that designs: this package, what it takes of others, and `flexarm_dynamics`."""
+    """Hash of the source code on which designs depend: this package, `TAKEN`, the kernels and `flexarm_dynamics`."""
     code, here = hashlib.sha256(), Path(__file__).parent
     paths = [here.parent / name for name in TAKEN]
     for folder in (here, here.parent / "kernels", Path(flexarm_dynamics.__file__).parent):
@@ -55,7 +55,7 @@ def path_of(name):
 
 
 def read(name):
-    """The entry, a mapping, that was written under a `key`; None where there is none that can be used."""
+    """The entry, a mapping, that was written under a `key`; None if there is no usable one."""
     try:
         found = json.loads(path_of(name).read_text(encoding="utf-8"))
         entry = found["entry"]
@@ -66,12 +66,12 @@ def read(name):
 
 
 def write(name, entry):
-    """Keep an entry, plain data, under a `key`; where the disk refuses, it is made again the next time."""
+    """Keep an entry, plain data, under a `key`; if it cannot be written, the design is made again next time."""
     path = path_of(name)
     body = _text({"key": name, "sum": _hash(_text(entry)), "entry": entry})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Whole or not at all, also when two processes write at once.
+        # The file appears completely or not at all, even if two processes write at once.
         with tempfile.NamedTemporaryFile(
             "w", dir=path.parent, suffix=".tmp", delete=False, encoding="utf-8"
         ) as file:

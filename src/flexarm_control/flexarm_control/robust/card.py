@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a design bears: how far gain, phase, delay, payload and stiffness may be off until a loop becomes unstable."""
+"""Margins of a design: how far gain, phase, delay, payload and stiffness may be off before a loop becomes unstable."""
 
 from dataclasses import dataclass, replace
 
@@ -17,41 +17,42 @@ from .settling import Motion
 from .tip import Tip, softest
 from .uncertain import richer
 
-#: Bisections of a limit, and the farthest that is looked: factors, and periods of delay.
+#: Number of bisections of a limit, and how far it is searched for: the largest factor, and the most periods of delay.
 BISECTIONS, FARTHEST, LATEST = 12, 16.0, 40.0
-#: A pole with the decay d has 2 % left after this over d.
+#: The response of a pole with the decay d falls to 2 % in this time over d.
 LEFT = 4.0
-#: Steps per locked period of a motion whose largest torque is looked for.
+#: Steps per locked period of a motion of which the largest torque is computed.
 PEAK_STEPS = 200
 
 
 @dataclass(frozen=True)
 class Card:
-    """Limits within which all loops of a design are stable, each by itself, the rest as in the arm file.
+    """Limits within which the loops in all configurations are stable; one quantity varies, the rest is as in the file.
 
     Attributes
     ----------
     gain, payload, stiffness : (float, float)
-        Least and greatest factor; 0 and infinite: none was found within `FARTHEST` [-].
+        Least and greatest factor; 0 and infinite: no limit was found within `FARTHEST` [-].
     delay : float
         Longest delay [s]; infinite: beyond `LATEST` periods.
     phase : float
-        Phase margin: by so much the torques of all joints may lag or lead [rad].
+        Phase margin: the torques of all joints may lag or lead by this angle [rad].
     damping : float
-        Least damping ratio of the poles below omega_c, the arm as in its file [-].
+        Least damping ratio of the poles below omega_c, for the arm of the file [-].
     settling : float
-        Time after which a tip that a constant force has moved and that is let go has 2 % left, the arm as in its file,
-        in the slowest configuration [s].
+        Settling time of the tip to 2 % after a constant force is removed, for the arm of the file, in the slowest
+        configuration [s].
     slowest : float
-        After this time the slowest pole of the uncertain loops has 2 % left [s].
+        The response of the slowest pole of the uncertain loops falls to 2 % in this time [s].
     torque_used : ndarray, shape (2, n), or None
         Largest torque of each joint over its limit, when any one joint turns by `settling.ANGLE` in `settling.MOTION`
         locked periods: with the payload of the file, and with the heaviest [-]. It includes the weight where the motion
         ends, and leaves out friction and Coriolis forces. Zero for a joint without a limit, NaN if the arm does not
         rest. None: no link bends, or no joint has a limit.
     tip_stiffness, tip_stiffness_proportional : float
-        Of the tip against a static force, in the softest direction and configuration: when the integral has brought
-        the joints back, so that the links alone bend, and without the integral [N/m].
+        Stiffness of the tip against a static force, in the softest direction and configuration [N/m]. The first is
+        that after the integral has brought the joints back, so that only the links bend; the second is that without
+        the integral.
     """
 
     gain: tuple
@@ -83,7 +84,7 @@ def card(design):
             yield sampled_loop(nominal, plants[key], q, late, gain)
 
     def stable(phase=0.0, **off):
-        # A loop with real numbers and a lag is as stable as one with the same lead.
+        # The loop's matrices are real, so a lag and a lead by the same angle are equally stable.
         turn = np.exp(-1j * phase) if phase else 1.0
         try:
             return all(
@@ -157,7 +158,7 @@ def torque_used(design, payload):
 
 
 def poles(design):
-    """Poles of all loops that a design is for: (name, fraction of the decay that is asked, s (k,)) of each [1/s]."""
+    """Poles of all loops of a design: for each loop (name, fraction of the decay that is asked, s (k,) [1/s])."""
     return [
         (loop.name, loop.fraction, np.log(eigenvalues(loop, K)[1]) / loop.period)
         for loop, K in design.loops()
@@ -169,13 +170,13 @@ def _poles(loop, K):
 
 
 def limit(stable, low, high, bisections=BISECTIONS):
-    """Where `stable` ends between `low`, where it holds, and `high`; infinite if it holds there.
+    """The limit between `low` and `high` up to which `stable` is true; infinite if it is true up to `high`.
 
-    The `bisections` follow a coarse search outwards.
+    A coarse search outwards comes first, then the `bisections`. If `stable` is false at `low`, the limit is `low`.
     """
     if not stable(low):
         return low
-    # Outwards first: beyond the first instability a loop may be stable again.
+    # Outwards first, since beyond the first instability a loop may be stable again.
     steps = np.geomspace(max(low, 0.25), high, 9)[1:]
     for step in steps:
         if not stable(step):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The slowest decay of a set of loops, and its gradient by the gains.
+r"""The slowest decay of a set of loops, and its gradient with respect to the gains.
 
 Each pole :math:`s = \ln(z)/h` of each loop has the value
 
@@ -7,16 +7,15 @@ Each pole :math:`s = \ln(z)/h` of each loop has the value
     \omega_1\min\bigl(1, \sqrt{4\omega_1/|s|}\bigr) & |s| \le \omega_c \\
     \min(\omega_1, \zeta|s|) & \text{beyond,}\end{cases}
 
-so that up to omega_c, where torque reaches, v is minus the decay over the lowest bending frequency omega_1 with the
-joints locked; of modes that are much stiffer less is asked, since a motion hardly excites them. Still stiffer modes are
-only asked to keep a fraction of their own damping zeta, and of loops that are less likely a fraction of all this is
-asked. A pole that grows counts by omega_1, whatever it is. The largest v of all poles is what a design makes small.
-With the right and left eigenvectors x, y of F - G K N,
+where d is the decay that is asked of the pole. Up to omega_c, where torque reaches, v is minus the decay over the
+lowest bending frequency omega_1 with the joints locked. Beyond :math:`4\omega_1` less decay is asked, since a motion
+hardly excites modes that stiff. Modes beyond omega_c are only asked to keep a fraction of their own damping, zeta. Of
+loops that are less likely, a fraction of all this is asked. For a pole that grows, d is omega_1 at any frequency. A
+design makes the largest v of all poles small. With the right and left eigenvectors x, y of F - G K N,
 
 .. math:: \frac{\partial s}{\partial K_{ab}} = -\frac{(y^HG)_a\,(Nx)_b}{h\,z\,y^Hx} .
 
-A pole that hardly moves with any gain is left to itself: its mode is one that torque does not reach or gauges do not
-see.
+A pole that hardly moves with any gain does not count: torque does not reach its mode, or the gauges do not see it.
 """
 
 from dataclasses import dataclass
@@ -30,13 +29,13 @@ from ..kernels import compiled
 from ..kernels.poles import DEAD_BEAT
 from .threads import in_parts
 
-#: A pole counts as one that no gain moves below this change of v by one unit of all scaled gains.
+#: Gains do not move a pole if the gradient of v by the scaled gains is no longer than this [-].
 UNMOVED = 0.01
-#: A pole that grows by more than this counts whether or not gains move it [-].
+#: A pole with a larger v than this always counts, whether or not gains move it [-].
 GROWS = 1e-9
-#: So many poles of a loop are looked at for one that gains move.
+#: The number of poles of a loop among which one that gains move is searched for.
 MOST = 12
-#: Poles have a say in the smooth maximum from so many widths below the largest on.
+#: Poles count in the smooth maximum if v is at most this many widths below the largest one.
 BELOW = 6.0
 
 
@@ -49,7 +48,7 @@ class Wanted:
     zeta: float  # [-]
 
     def decay(self, s, fraction=1.0):
-        """d of each pole [1/s], of a loop of which this fraction is asked."""
+        """d of each pole s [1/s], in a loop of which this fraction of the decay is asked."""
         return np.vectorize(compiled().asked, otypes=[float])(s, fraction, *self.values)
 
     @property
@@ -59,7 +58,7 @@ class Wanted:
 
 
 def eigenvalues(loop, K):
-    """The closed loop's matrix, and its eigenvalues in the upper half plane but for those of delays."""
+    """The closed loop's matrix, and its eigenvalues in the upper half plane except those of delays."""
     closed = loop.F - loop.G @ (K @ loop.N)
     z = np.linalg.eigvals(closed)
     return closed, z[(np.abs(z) > DEAD_BEAT) & (z.imag >= 0.0)]
@@ -68,8 +67,8 @@ def eigenvalues(loop, K):
 class Stack:
     """Loops with equally many states, as arrays whose first index is the loop.
 
-    Their states are scaled so that rows and columns of the closed loop are about as large, which eigenvalues need to be
-    exact. This is done for K = `scale`; other gains are assumed to be about as large.
+    The states are scaled so that rows and columns of the closed loop's matrix are about equally large: eigenvalues are
+    accurate only then. The scaling is made for K = `scale`; other gains are assumed to be about as large.
 
     Parameters
     ----------
@@ -88,12 +87,12 @@ class Stack:
 
 
 def _sizes(matrix):
-    """Sizes of states, powers of two, with which rows and columns of a matrix are about as large."""
+    """Scales of the states, powers of two, that make rows and columns of a matrix about equally large."""
     return matrix_balance(matrix, permute=False, separate=True)[1][0]
 
 
 class Poles:
-    """Poles of a stack of loops under gains, of each the largest v first; see `poles_of`.
+    """Poles of a stack of loops under gains, those of each loop with the largest v first; see `poles_of`.
 
     Parameters
     ----------
@@ -112,11 +111,11 @@ class Poles:
         self._H, self._tau = np.empty(stack.F.shape), np.empty(shape)
         self._z, self.s = np.empty(shape, complex), np.empty(shape, complex)
         self.asked, self.v, self._count = np.empty(shape), np.empty(shape), np.empty(len(K), int)
-        self._known = np.zeros(len(K), int)  # gradients of the first so many poles
+        self._known = np.zeros(len(K), int)  # of how many first poles the gradients are known
         self._slopes = np.zeros((len(K), 0, *K.shape[1:]))
 
     def ranking(self, wanted):
-        """A call for `in_parts` that finds the poles."""
+        """The call for `in_parts` that finds the poles."""
         stack, values = self.stack, wanted.values
         arrays = (
             stack.F, stack.G, stack.N, self._K, stack.period, stack.fraction,
@@ -130,7 +129,7 @@ class Poles:
         return (self._count >= 0).all()
 
     def missing(self, count):
-        """Calls for `in_parts` that find the gradients of the first `count` (L,) poles of each loop, if missing."""
+        """Calls for `in_parts` that find missing gradients, those of the first `count` (L,) poles of each loop."""
         if (count <= self._known).all():
             return
         stack, before, known = self.stack, self._slopes, self._known
@@ -155,13 +154,13 @@ def poles_of(stacks, gains, wanted):
     ----------
     stacks : sequence of Stack
     gains : sequence of ndarray, shape (L, n, 3n + 2m)
-        Of each loop of each stack.
+        Gains of each loop, one array for each stack.
     wanted : Wanted
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        Where the eigenvalues of a loop are not found.
+        If the eigenvalues of a loop are not found.
     """
     all_ = [Poles(stack, K) for stack, K in zip(stacks, gains, strict=True)]
     in_parts([one.ranking(wanted) for one in all_])
@@ -171,12 +170,12 @@ def poles_of(stacks, gains, wanted):
 
 
 def find_gradients(all_, counts):
-    """Find the gradients of the first poles of each loop, so many of each as `counts` says, one (L,) of each stack."""
+    """Find the gradients of the first poles of each loop; `counts` has their numbers, one array (L,) per stack."""
     in_parts([call for one, count in zip(all_, counts, strict=True) for call in one.missing(count)])
 
 
 class Moved(NamedTuple):
-    """The pole of a loop with the largest v of those that gains move."""
+    """Of the poles of a loop that gains move, the one with the largest v."""
 
     v: float  # [-]; -inf: gains move none
     s: complex  # [1/s]
@@ -192,7 +191,7 @@ class Slowest:
     loops : sequence of Loop
     wanted : Wanted
     scale : ndarray, shape (n, 3n + 2m)
-        Unit of each gain; 0: the gain is none.
+        Unit of each gain; 0: there is no such gain.
     """
 
     def __init__(self, loops, wanted, scale):
@@ -212,7 +211,7 @@ class Slowest:
         return K[self.free] / self._unit
 
     def of_loops(self, loops, x):
-        """K that each of some loops has under scaled gains x, (L, n, 3n + 2m)."""
+        """K of each of the `loops` under scaled gains x, (L, n, 3n + 2m)."""
         return np.repeat(self.gains(x)[None], len(loops), axis=0)
 
     def _of_all(self, loops, slopes):
@@ -224,12 +223,12 @@ class Slowest:
         return np.sqrt((slopes**2).sum(axis=-1))
 
     def each(self, x):
-        """What is `Moved` of each loop under scaled gains x, a list in the order of the loops.
+        """The `Moved` of each loop under scaled gains x, a list in the order of the loops.
 
         Raises
         ------
         numpy.linalg.LinAlgError
-            Where the eigenvalues of a loop are not found.
+            If the eigenvalues of a loop are not found.
         """
         found = [None] * len(self.loops)
         for (at, _), poles in zip(
@@ -240,7 +239,7 @@ class Slowest:
         return found
 
     def _moved(self, poles):
-        """What is `Moved` of each loop of a stack."""
+        """The `Moved` of each loop of a stack."""
         found, passed = [None] * len(poles.v), [()] * len(poles.v)
         for at in range(min(MOST, poles.v.shape[1])):
             left = [k for k, v in enumerate(poles.v[:, at]) if found[k] is None and v > -np.inf]
@@ -260,9 +259,9 @@ class Slowest:
         return [one or other for one, other in zip(found, none, strict=True)]
 
     def _near(self, poles, count):
-        """Gradients of the v of the first `count` poles of each loop by its scaled gains, and their lengths by x.
+        """Gradients of v of the first `count` poles of each loop by its own scaled gains, and lengths of those by x.
 
-        `find_gradients` must have found them. (L, count, gains) and (L, count).
+        The shapes are (L, count, gains) and (L, count). `find_gradients` must have been called before.
         """
         slopes = poles.slopes[:, :count, self.free]
         slopes = slopes * (self._unit / poles.asked[:, :count, None])
@@ -273,8 +272,8 @@ class Slowest:
 
         .. math:: w\ln\sum_i e^{v_i/w}
 
-        over all poles that gains move, of a `width` w: all that are near the largest have a say. Infinite where
-        eigenvalues are not found.
+        The sum is over all poles that gains move and whose v is near the largest. The `width` w is relative to the
+        largest v if that is above 1. The function is infinite where eigenvalues are not found.
         """
         stacks = [stack for _, stack in self._stacks(loops)]
 
@@ -299,7 +298,7 @@ class Slowest:
         return function
 
     def _moving(self, found, least):
-        """Of each stack the v that are at least so large, -inf of those that gains do not move, and their gradients."""
+        """For each stack the v of poles from `least` on, and their gradients; v is -inf for poles that do not count."""
         counts = [(poles.v >= least).sum(axis=1) for poles in found]
         find_gradients(found, counts)
         near = []
@@ -312,7 +311,7 @@ class Slowest:
         return near
 
     def _sum(self, found, near, worst, w):
-        """What is `smooth`, and its gradient."""
+        """The value of `smooth`, and its gradient."""
         total, slope = 0.0, 0.0
         for poles, (v, slopes) in zip(found, near, strict=True):
             weight = np.exp((v - worst) / w)
@@ -329,21 +328,21 @@ class Slowest:
         return self._stacks(self.loops)
 
     def _stacks(self, loops):
-        """Numbers of loops with equally many states, and their `Stack`."""
+        """Groups of loops with equally many states: the numbers of the loops, and their `Stack`."""
         sizes = [len(loop.F) for loop in loops]
         same = [[k for k, size in enumerate(sizes) if size == one] for one in sorted(set(sizes))]
         return [(at, Stack([loops[k] for k in at], self.scale)) for at in same]
 
 
 class SlowestScheduled(Slowest):
-    """As `Slowest`, of several sets of gains at once: each loop has their mean with `weights` of its own.
+    """As `Slowest`, for several sets of gains at once: each loop has their mean, weighted with its own `weights`.
 
     Parameters
     ----------
     loops, wanted, scale
         As of `Slowest`.
     weights : sequence of ndarray, shape (k,)
-        Of each loop.
+        Weights of the sets in each loop.
     """
 
     def __init__(self, loops, wanted, scale, weights):
@@ -362,7 +361,7 @@ class SlowestScheduled(Slowest):
         return np.tensordot(self._of(loops), self.gains(x), 1)
 
     def _of(self, loops):
-        """Weights of all sets in some loops, (L, k)."""
+        """Weights of all sets in each of the `loops`, (L, k)."""
         return np.array([self._weights[id(loop)] for loop in loops])
 
     def _split(self, x):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control of an arm for which no law is given: a design for that arm, from the cache or made now.
+"""The control of an arm if no law is given: a design for that arm, read from the cache or made now.
 
-Parameters that are given by hand stay, each on its own. A law given by hand (`LAWS`) is a choice of the control as a
-whole, and so is the name of one of the paper's arms (`PAPER_ARMS`): the parameters' own defaults, the paper's control,
-are made for these.
+Each parameter that is given by hand stays as it is. No design is used if a law is given by hand (`LAWS`) or if the arm
+is one of the paper's, by its name (`PAPER_ARMS`). Both choose the control as a whole: the parameters' own defaults are
+the paper's control, which is made for these arms.
 """
 
 from typing import NamedTuple
@@ -17,11 +17,11 @@ from .card import card
 from .design import Settings, design, observer_parameters, places, sampling_for
 from .uncertain import Uncertainty
 
-#: Shipped arms, by name, that the parameters' defaults are made for.
+#: Names of the shipped arms for which the parameters' defaults are made.
 PAPER_ARMS = ("R", "P3", "R_lab", "one_link")
 #: Parameters that choose the control by hand.
 LAWS = ("slow.type", "fast.type")
-#: What a design chooses; a rigid arm's has no fast law.
+#: Types that a design uses; the design of a rigid arm has no fast law.
 TYPES = {
     "slow.type": "joint_pid",
     "fast.type": "fixed_gain",
@@ -78,11 +78,11 @@ NAMES = frozenset(p.name for p in PARAMETERS)
 
 
 class Default(NamedTuple):
-    """A design, as far as nodes need it."""
+    """The parts of a design that nodes need."""
 
     parameters: dict  # flat
-    delay: float  # it is made for [s]
-    bears_delay: float  # longest one with which it is stable [s]
+    delay: float  # for which it is made [s]
+    bears_delay: float  # longest delay with which it is stable [s]
     reached: float  # `Design.reached` [-]
     speed: float  # of the design [-]
     slowed: bool  # `Design.slowed`
@@ -95,7 +95,8 @@ def is_wanted(name, given, kind=AUTO):
     Parameters
     ----------
     name : str
-        Of the arm, as it was given: a shipped name or a path; empty for an arm that is no file's, which gets none.
+        Of the arm, as it was given: a shipped name or a path. It is empty for an arm without a file. Such an arm gets
+        no design unless `kind` is robust.
     given : collection of str
         Names of the parameters that are given by hand.
     kind : str
@@ -112,7 +113,7 @@ def task(arm, values):
     Raises
     ------
     ParameterError
-        For factors whose range does not hold 1, and for configurations that are no whole number of them.
+        If a range of factors does not contain 1, or if the angles give no whole number of configurations.
     """
     n, at = len(arm.joints), values["design.configurations"]
     if len(at) % n:
@@ -141,7 +142,7 @@ def task(arm, values):
 
 
 def find(arm, settings, uncertainty):
-    """A design as the plain data that the cache keeps; it takes seconds to minutes."""
+    """Make a design, and return the plain data that the cache keeps of it. This takes seconds to minutes."""
     found = design(arm, settings, uncertainty)
     try:
         found.check()
@@ -163,7 +164,7 @@ def default(arm, settings, uncertainty, make=find):
     Raises
     ------
     DesignError
-        When no gains hold; with what is in the way.
+        If no stable gains are found; names the loop and the pole that are unstable.
     """
     name = cache.key(arm, settings, uncertainty)
     entry = cache.read(name)
@@ -176,17 +177,17 @@ def default(arm, settings, uncertainty, make=find):
 
 
 def is_cached(arm, settings, uncertainty):
-    """Whether `default` need not make the design."""
+    """Whether the design is in the cache, so that `default` need not make it."""
     return cache.read(cache.key(arm, settings, uncertainty)) is not None
 
 
 def for_observer(model, settings):
-    """Flat parameters of the observer of the design for a `model`, without a search."""
+    """Flat parameters of the observer that a design for a `model` has; computed without a search."""
     return observer_parameters(sampling_for(model, places(model, settings), settings)[0])
 
 
 def wanted_task(name, arm, values):
-    """The `task` of the design for flat parameters that are given; None where no design `is_wanted`.
+    """The `task` of the design for given flat parameters; None if no design `is_wanted`.
 
     Parameters
     ----------
@@ -203,9 +204,10 @@ def wanted_task(name, arm, values):
 
 
 def complete(name, arm, values):
-    """Flat parameters with those of a design below them where one `is_wanted`, and its `Default` or None.
+    """The given flat parameters, completed by those of a design if one `is_wanted`; and its `Default` or None.
 
-    `name`, `arm` and `values` are those of `wanted_task`; what comes back is without `PARAMETERS`.
+    `name`, `arm` and `values` are those of `wanted_task`. Given values take precedence over those of the design. The
+    result does not contain `PARAMETERS`.
     """
     rest = {k: v for k, v in values.items() if k not in NAMES}
     wanted = wanted_task(name, arm, values)

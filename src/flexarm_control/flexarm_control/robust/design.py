@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Gains for an arm that is not quite what its file says.
+r"""Robust gains: a design for an arm that differs from its arm file.
 
-The control is of fixed structure: stiffness, damping and integral of each joint (`slow.type: joint_pid`) and a
-constant feedback of modal amplitudes and rates (`fast.type: fixed_gain`), both about the motion of the feed-forward.
-Its gains are found for a set of sampled loops at once (multi-model design): payload, stiffness, damping, loop gain,
-delay and configuration vary, the arm has one mode more per direction than the file, and filters and delay are part of
-each loop (`loop`). What is made as fast as possible is the slowest pole of them all (`decay`), found by BFGS on the
-nonsmooth function (`nonsmooth`) from several starts. The noise that the gains pass on to the torque is bounded.
+The control has a fixed structure: stiffness, damping and integral of each joint (`slow.type: joint_pid`) and a constant
+feedback of modal amplitudes and rates (`fast.type: fixed_gain`), both about the motion of the feed-forward. One search
+finds its gains for a whole set of sampled loops (multi-model design). Payload, stiffness, damping, loop gain, delay and
+configuration vary; the arm has one mode more per direction than the file; filters and delay are part of each loop
+(`loop`). The search makes the slowest pole of all loops as fast as possible (`decay`). It minimises this nonsmooth
+function by BFGS (`nonsmooth`) from several starts. The noise that the gains pass on to the torque is bounded.
 
-The literature knows this as static output feedback by minimisation of the spectral abscissa (Burke, Henrion, Lewis &
+In the literature this is static output feedback by minimisation of the spectral abscissa (Burke, Henrion, Lewis &
 Overton 2006, HIFOO; Ackermann 1980 for the multi-model idea).
 """
 
@@ -42,54 +42,60 @@ from .uncertain import (
     uncertain_loops,
 )
 
-#: Corner of the filtered derivatives over omega_c, at most one radian per sample; of a fast arm, for which the lag of
-#: such a filter counts, at least so many times omega_1, at most two radians per sample.
+#: Corner of the filtered derivatives: the first number times omega_c, but at most one radian per sample. For a fast
+#: arm the lag of such a filter matters. So the corner is at least the second number times omega_1, or the third number
+#: in radians per sample if that is lower.
 FILTER, FAST_ARM, PER_SAMPLE = 2.0, 15.0, 2.0
-#: Corners of the torque's low pass that are tried, over omega_1; infinite: none.
+#: Corners of the torque's low pass that the search tries, over omega_1; infinite: no low pass.
 LOW_PASS = (np.inf, 20.0, 8.0, 4.0)
-#: A low pass costs margins of gain and phase, and is taken where it makes the decay larger by more than this factor.
+#: A low pass costs gain and phase margin. It is chosen only if it makes the decay larger by more than this factor.
 SLUGGISH = 1.25
-#: The controller's own check has neither filters nor delay, which the design has.
+#: A `stability_margin` so low that the controller's own check passes: it has neither the filters nor the delay.
 UNCHECKED = -1000.0
-#: Beside a period a torque is under way for so long between processes [s].
+#: Time that a torque takes between processes, in addition to one period [s].
 TRANSPORT = 1e-3
-#: A pole is hardly in reach of the torque where one unit of all gains changes its value by less than this [-], and fast
-#: for the loop where the torque's delay turns it by more than this [rad].
+#: Torque hardly moves a pole if the gradient of its value by the scaled gains is shorter than the first number [-]. A
+#: pole is too fast for the loop if the delay turns the torque for it by more than the second [rad].
 HARDLY, FAST = 1.0, 0.5
-#: Why a design has a lower speed than was asked.
+#: Why a design has a lower speed than requested.
 FROM_LIMITS = "an arm with faster gains would not come back from them in time"
-#: Where scheduled gains reach less of the decay than this, low passes are tried that end the torque's reach: of faster
-#: modes only their own damping is asked. Taken where the decay is so many times larger [-].
+#: If the decay of the first search is less than `POOR` times the speed, low passes with a corner below omega_c are
+#: tried. Modes beyond such a corner are only asked to keep their own damping. The result is used if its decay is more
+#: than `WORTH` times larger [-].
 POOR, WORTH = 0.25, 1.2
-#: Where those reach less than this, one set for all is tried, too; the same without them, where that is below
-#: `further.LEAST`, or below this if there are no such low passes [-].
+#: If gains scheduled with such low passes reach less decay than this, one set for all configurations is tried as well.
+#: One set without these low passes is tried if the best decay so far is below `further.LEAST`, or, if there are no such
+#: low passes, below this [-].
 LITTLE = 0.08
-#: Where the decay that is reached is less than this, the search goes on from gains nearby, at most so many times, and
-#: looks at arms of which payload or stiffness alone differs, too. Then it does so for the loops that do not limit the
-#: others, which keep this decay [-].
+#: If the decay is less than `SLOW` times the speed, the search goes on from nearby gains, at most `TRIES` times. Its
+#: loops then include arms of which only payload or only stiffness differs. Afterwards it does the same for the loops
+#: that do not limit the decay; those that limit it keep the decay `KEPT` [-].
 SLOW, TRIES, KEPT = 0.2, 6, 0.055
-#: Finite slopes take long to compute: the feed-forward has them where its steps per sample, times modes, are no more.
+#: The model with finite slopes takes long to compute. The feed-forward uses it only if the number of steps per sample,
+#: times the number of modes, is at most this.
 QUICK = 12
-#: It has one mode more than the file where the fastest frequency is then at most so many times the lowest one, with the
-#: joints locked: a plan is integrated in steps of the fastest one [-].
+#: The feed-forward has one mode more than the file if its fastest frequency is then at most this many times the lowest
+#: one, with the joints locked. The fastest frequency sets the steps in which a plan is integrated [-].
 SPREAD = 2000.0
-#: Where a loop does not come back from its torque limits (`recovery`), designs of these parts of the speed are made.
+#: If the arm does not come back from its torque limits (`recovery`), designs at these fractions of the speed follow.
 SLOWER = (0.7, 0.5, 0.35)
-#: A lower speed counts as this one.
+#: Lowest speed; a lower one counts as this.
 SLOWEST = 0.05
-#: Of the progress, the end of the first design, which slower ones may follow. Of each design, the end of the usual
-#: search, of what is tried where that reaches little, and of what is nearby.
+#: Progress at the end of the first design; slower designs may follow. Then, within one design, progress at the end of
+#: the usual search, of the attempts after a poor result, and of the search from nearby gains.
 FIRST, USUAL, OTHERWISE, NEARBY = 0.7, 0.6, 0.8, 0.9
-#: Part of the file's Coulomb friction that is cancelled: friction may be less by a fifth. Less where, until the torque
-#: can answer, friction would move a joint farther than this [rad]: cancelled, it would make such a joint hunt.
+#: Fraction of the file's Coulomb friction that is cancelled, since friction may be less by a fifth. The fraction is
+#: smaller if friction would move a joint farther than this angle [rad] before the torque can answer. With full
+#: cancellation such a joint would hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
-#: Decay over omega_1, and noise over the torque limit, that the fastest design looks for.
+#: Decay over omega_1, and noise over the torque limit, at which the fastest design aims.
 FASTEST, NOISIEST = 0.6, 0.03
-#: `slow.return_rate` over omega_1. A joint that sticks goes back by gamma / (1 - gamma) of that, with the part gamma of
-#: its friction cancelled: as fast as the fastest decay. More would hold it so stiffly that it damps no link any more.
+#: `slow.return_rate` over omega_1. With the fraction gamma of its friction cancelled, a joint that sticks goes back at
+#: gamma / (1 - gamma) times this rate: as fast as the fastest decay. A higher rate would hold the joint so stiffly that
+#: it no longer damps the links.
 RETURN = FASTEST * (1.0 - CANCELLED) / CANCELLED
-#: Part of the friction that is overcome where a joint sticks, and `slow.breakaway_rate` over omega_1: at twice that a
-#: light hub hunted.
+#: Fraction of the friction that is overcome where a joint sticks, and `slow.breakaway_rate` over omega_1. At twice this
+#: rate a light hub hunted.
 BREAKAWAY, BREAKAWAY_RATE = 0.95, 0.5
 
 
@@ -102,18 +108,18 @@ class Settings:
     rate : float
         Samples per second [Hz].
     delay : float
-        From a measurement until its torque acts [s]; not given: one period and `TRANSPORT`.
+        From a measurement until its torque acts [s]; if not given, one period plus `TRANSPORT`.
     speed : float
-        From 0 to 1: how much decay is looked for, and how much noise the torque may have for it. 1: `FASTEST` and
-        `NOISIEST`, the rms torque of the sensors' noise over the torque limit.
+        From 0 to 1: the decay at which the design aims, and the noise that it allows. At 1 these are `FASTEST` and
+        `NOISIEST`, the rms torque due to the sensors' noise over the torque limit.
     configurations : tuple of tuple of float
-        Where the arm moves [rad]; none: drawn from its position limits.
+        Where the arm moves [rad]; if none are given, they are drawn from its position limits.
     effort : float
-        Of the search; 1.0 is the default.
+        Factor of the work in the search; 1.0 is the default.
     seed : int
-        Of the starts.
+        Of random configurations and of random starts near gains that were found.
     feedforward : str
-        Name of the feed-forward that the controller file takes; the gains do not depend on it.
+        Name of the feed-forward in the controller file; the gains do not depend on it.
     """
 
     rate: float = 1000.0
@@ -140,14 +146,14 @@ class SlowPole(NamedTuple):
 
 @dataclass(frozen=True)
 class Design:
-    """Gains, and what they were found to do.
+    """Gains, and the properties of the loops with them.
 
     Attributes
     ----------
     K : ndarray, shape (n, 3n + 2m)
-        u = -K (q, qd, -w, delta, delta_d); where they are scheduled, those of the first configuration.
+        u = -K (q, qd, -w, delta, delta_d); scheduled gains: those of the first configuration.
     decay : float
-        Slowest decay of all poles that gains move, over what is wanted of them [-]; negative: unstable.
+        Decay of the slowest pole that gains move, over the decay that is asked of it [-]; negative: unstable.
     omega_1 : float
         Lowest bending frequency with the joints locked [rad/s].
     omega_c : float
@@ -159,15 +165,16 @@ class Design:
     left : tuple of float
         Frequencies of modes that no gain moves, at the first configuration [rad/s].
     noise : tuple of float
-        Of each joint: rms torque of the sensors' noise over the torque limit [-].
+        Of each joint: rms torque due to the sensors' noise over the torque limit [-].
     slope : float
-        By how much one unit of all gains changes the value of the slowest pole [-].
+        Length of the gradient of the slowest pole's value by the scaled gains [-].
     sets : ndarray, shape (k, n, 3n + 2m)
         One set of gains for all configurations, or one for each; see `flexarm_control.schedule`.
     recovery : Recovery or None
-        From motions that take nearly all torque; None: not looked at.
+        From motions that take nearly all torque; None: not computed.
     slowed : bool
-        Whether its speed is lower than asked, because faster gains would not come back from the torque limits.
+        Whether the speed is lower than requested, because the arm would not come back from its torque limits with
+        faster gains.
     """
 
     arm: object
@@ -194,12 +201,12 @@ class Design:
 
     @property
     def reached(self):
-        """The least decay over what is asked, of the arms with other payloads and stiffnesses alone [-]."""
+        """The least decay over what is asked, of the loops of kind `ARM` only [-]."""
         return -max(row.value for row in self.slowest if row.kind == ARM)
 
     @property
     def worst(self):
-        """The `SlowPole` of the loop that is the slowest of all, relative to what is asked of it."""
+        """The `SlowPole` of the slowest loop, relative to what is asked of it."""
         return max(self.slowest, key=lambda row: row.value)
 
     @property
@@ -208,11 +215,11 @@ class Design:
         return len(self.sets) > 1
 
     def gains_at(self, number):
-        """K of a configuration, by its number from 0, (n, 3n + 2m)."""
+        """K of a configuration, (n, 3n + 2m); its number counts from 0."""
         return self.sets[number if self.scheduled else 0]
 
     def loops(self):
-        """The loops that the design is for, each with its gains: pairs of `Loop` and K."""
+        """The loops of the design, each with its gains: pairs of `Loop` and K."""
         loops, weights = held_loops(
             build(self.arm.known),
             self.configurations,
@@ -231,16 +238,16 @@ class Design:
 
     @property
     def comes_back(self):
-        """Whether it comes back from the torque limits, as far as that was looked at."""
+        """Whether the arm comes back from its torque limits; True if that was not computed."""
         return self.recovery is None or self.recovery.comes_back
 
     def check(self):
-        """Refuse a design that does not hold.
+        """Refuse a design of which a loop is unstable.
 
         Raises
         ------
         DesignError
-            With the loop and the pole that are in the way, and what would help.
+            Names the loop and the pole that are unstable, and what would help.
         """
         if not self.holds:
             problem = in_the_way(self)
@@ -288,16 +295,17 @@ class Design:
 
 
 def numbers(values):
-    """A list of numbers as parameters have them: six digits."""
+    """A flat list of numbers, rounded to six digits as in a parameter file."""
     return [float(f"{v:.6g}") for v in np.ravel(values)]
 
 
 def of_feedforward(arm, rate):
-    """What the feed-forward is to know of an arm beyond its file, flat parameters.
+    """Flat parameters that give the feed-forward a better model than the arm file's.
 
-    One mode more per direction, for what the file's modes leave out of the links' compliance: of several links with one
-    mode each, the next frequencies are 10 to 20 % too high. Not where that mode is too fast, `SPREAD`. And as much of
-    the kinematics of bending as the arm's loads need, within `levels.TOLERANCE` of its reach.
+    It has one mode more per direction, for the compliance of the links that the file's modes leave out: for several
+    links with one mode each, the next frequencies are 10 to 20 % too high. It leaves that mode out if the mode is too
+    fast (`SPREAD`). It has as much of the kinematics of bending as the arm's loads need, within `levels.TOLERANCE` of
+    the arm's reach.
     """
     if not arm.most_modes:
         return {"feedforward_modes": 0, "feedforward_level": "file"}
@@ -328,7 +336,7 @@ def observer_parameters(sampling):
 
 
 def in_the_way(found):
-    """Which loop no gains were found for, and by which pole, in words."""
+    """In words, which loop is unstable with the best gains found, and by which pole."""
     name, pole, *_ = found.worst
     return (
         f"no gains hold all of it: the best found lets a pole at {abs(pole) / (2.0 * np.pi):.3g} Hz grow at"
@@ -337,7 +345,7 @@ def in_the_way(found):
 
 
 def what_limits(found):
-    """Why the slowest pole of a design that holds is no faster, in words."""
+    """In words, why the slowest pole of a stable design is no faster."""
     pole = found.worst.pole
     hertz, lag = abs(pole) / (2.0 * np.pi), _lag(found, pole)
     if found.worst.kind == STICKS and abs(pole) < found.omega_1:
@@ -362,12 +370,12 @@ def what_limits(found):
 
 
 def _lag(found, pole):
-    """By how much the delay turns the torque for a mode [rad]."""
+    """Phase lag of the torque at the frequency of a pole, due to delay and sampling [rad]."""
     return abs(pole) * (found.sampling.delay + 0.5 * found.sampling.period)
 
 
 def what_helps(found):
-    """What to try, for the slowest pole of a design that does not hold."""
+    """In words, what to try against the slowest pole of an unstable design."""
     pole = found.worst.pole
     if _lag(found, pole) > FAST:
         return (
@@ -386,13 +394,13 @@ def what_helps(found):
 
 
 def places(nominal, settings):
-    """Configurations that a design is for, those of the `settings` or drawn, (k, n) [rad]."""
+    """Configurations of a design, (k, n) [rad]: those of the `settings`, or drawn ones."""
     given = settings.configurations or configurations(nominal.arm, settings.seed)
     return resting(nominal, given)
 
 
 def sampling_for(nominal, at, settings):
-    """How the loop samples, with the corners of its filters; and omega_c [rad/s]. It takes no search."""
+    """`Sampling` of the loop, with the corners of its filters, and omega_c [rad/s]; computed without a search."""
     h = 1.0 / settings.rate
     omega_c = reach(nominal, at, settings.delay + 0.5 * h)
     corner = min(settings.rate, FILTER * omega_c)
@@ -408,12 +416,12 @@ def sampling_for(nominal, at, settings):
 
 
 def cancelled(model, at, late):
-    r"""Part of each joint's Coulomb friction that a control may cancel, as a tuple; 0.0 where it has none.
+    r"""Fraction of each joint's Coulomb friction that the control may cancel, as a tuple; 0.0 for a joint without it.
 
     .. math:: \gamma_i = 0.8\min\Bigl(1, \frac{0.1^\circ}{f_{c,i}\,H_{ii}\,\tau^2}\Bigr)
 
-    with H the inverse of the mass matrix: when a joint breaks loose only its hub moves at first, and the torque that
-    cancels turns around after :math:`\tau`.
+    H is the inverse of the mass matrix: when a joint breaks loose, only its hub moves at first. When the joint turns
+    around, the torque that cancels friction changes its sign only after :math:`\tau`.
 
     Parameters
     ----------
@@ -421,7 +429,7 @@ def cancelled(model, at, late):
     at : ndarray, shape (k, n)
         Configurations [rad].
     late : float
-        From a joint's turning around until the torque's [s].
+        :math:`\tau`, from the moment a joint turns around until this torque does [s].
     """
     n, coulomb = model.n_joints, model.friction_table()[:, 1]
     H = np.max([np.diag(np.linalg.inv(model.terms(q, np.zeros(n)).M))[:n] for q in at], axis=0)
@@ -430,9 +438,9 @@ def cancelled(model, at, late):
 
 
 def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
-    """Gains for an arm file's arm.
+    """Gains for the arm of an arm file.
 
-    If the arm would not come back from its torque limits (`recovery`), slower gains are looked for: `SLOWER`.
+    If the arm would not come back from its torque limits (`recovery`), slower gains are searched for (`SLOWER`).
 
     Parameters
     ----------
@@ -440,20 +448,19 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
     settings : Settings, optional
     uncertainty : Uncertainty, optional
     progress : callable, optional
-        Called with a fraction of the work and the decay that is reached.
+        Called with the fraction of the work that is done and the decay that is reached.
     gains : ndarray, shape (n, 3n + 2m), optional
-        To start from as well.
+        An additional start.
 
     Returns
     -------
     Design
-        The best that was found, also where it is not stable: see its `decay`. Its `settings` have the speed that was
-        taken.
+        The best one found, even if it is unstable: see its `decay`. Its `settings` have the speed that was used.
 
     Raises
     ------
     DesignError
-        Where the arm rests in no configuration, or has nothing to measure its bending by.
+        If the arm rests in no configuration, or nothing measures its bending.
     """
     settings, uncertainty = settings or Settings(), uncertainty or Uncertainty()
     say = _Progress(progress)
@@ -464,7 +471,7 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
             break
         begin = FIRST + (1.0 - FIRST) * k / len(SLOWER)
         now = say.part(begin, begin + (1.0 - FIRST) / len(SLOWER))
-        # From starts of its own: gains that ask for much torque would stay so.
+        # With its own starts: from the faster gains the search would end at gains that also ask for much torque.
         other = design_at(arm, slower, uncertainty, now, asked=settings.speed)
         if other.holds and (other.comes_back or other.recovery.limited < found.recovery.limited):
             found = replace(other, slowed=True)
@@ -473,14 +480,14 @@ def design(arm, settings=None, uncertainty=None, progress=None, gains=None):
 
 
 def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None):
-    """A `Design` of the speed that is given, whether or not it comes back from the torque limits.
+    """A `Design` with the speed of the settings, whether or not the arm comes back from its torque limits.
 
     Parameters
     ----------
     arm, settings, uncertainty, progress, gains
-        As of `design`.
+        As for `design`.
     asked : float, optional
-        The speed that was asked, from which torque limits have lowered that of the settings [-].
+        The requested speed, if the settings have a lower one because of the torque limits [-].
 
     Returns
     -------
@@ -513,13 +520,13 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
 
 
 class _Progress:
-    """Fractions of a whole work from those of its parts: they do not fall."""
+    """Turns the progress of each part into that of the whole; the fraction never decreases."""
 
     def __init__(self, progress):
         self._progress, self._most = progress, 0.0
 
     def part(self, begin, end):
-        """Takes the fraction of a part, and the decay that is reached."""
+        """A callable for the part from `begin` to `end`: takes its fraction, and the decay that is reached."""
 
         def say(fraction, decay):
             self._most = max(self._most, begin + (end - begin) * fraction)
@@ -530,7 +537,7 @@ class _Progress:
 
 
 class Sets(NamedTuple):
-    """Gains of each configuration, and what they do."""
+    """Gains of each configuration, and the properties of the loops with them."""
 
     K: np.ndarray  # (k, n, 3n + 2m); one set, or one for each configuration
     sampling: Sampling
@@ -542,12 +549,12 @@ class Sets(NamedTuple):
 
     @property
     def decay(self):
-        """Of the slowest pole, over what is wanted [-]."""
+        """Of the slowest pole, over what is asked of it [-]."""
         return -max(row.value for row in self.rows)
 
 
 class Task:
-    """One design: what is searched, in one set of gains or in several.
+    """The searches of one design, for one set of gains or for several.
 
     Parameters
     ----------
@@ -555,18 +562,18 @@ class Task:
     settings : Settings
     uncertainty : Uncertainty
     short : bool
-        Whether the torque has low passes that end its reach, and no others.
+        Whether the search tries only low passes with a corner below omega_c, which end the torque's reach.
 
     Attributes
     ----------
     nominal : ArmModel
-        Of the arm as the control knows it.
+        Model of the arm as the control knows it.
     at : ndarray, shape (k, n)
         Configurations [rad].
     speed : float
-        Of the settings, and at least `SLOWEST` [-].
+        That of the settings, but at least `SLOWEST` [-].
     low_passes : tuple of float
-        Corners that are tried, over omega_1; if `short`, those below omega_c: there may be none.
+        Corners that the search tries, over omega_1; if `short`, only those below omega_c, which may be none.
     """
 
     def __init__(self, arm, settings, uncertainty, short=False):
@@ -586,14 +593,14 @@ class Task:
         self.speed = max(settings.speed, SLOWEST)
 
     def found(self, progress, gains, enough):
-        """A set for each configuration; where these reach less than `enough`, one for all may be better."""
+        """A set for each configuration; if these reach less decay than `enough`, one set for all is tried as well."""
         if len(self.at) == 1:
             return self.alone(progress, gains)
         sets = self.scheduled(progress, gains)
         return sets if sets.decay >= enough else self.found_alone(progress, gains, sets)
 
     def found_alone(self, progress, gains, sets):
-        """The better one of `sets` and of one set for all, from which one for each configuration goes on."""
+        """The better one of `sets` and of one set for all, from which a search for one set for each goes on."""
         if len(self.at) == 1:
             return sets
         alone = self.alone(progress, gains)
@@ -613,7 +620,7 @@ class Task:
         return self._together(search.slowest.gains(x)[None], search.sampling, used)
 
     def scheduled(self, progress, gains):
-        """A set for each configuration: a race in the first one, the others from the best of those found."""
+        """A set for each configuration: by a race in the first one, then from the best of the sets found so far."""
         count = len(self.at)
 
         def say(fraction, decay):
@@ -635,7 +642,10 @@ class Task:
         return self._together(K, searches[chosen][0].sampling, used)
 
     def _together(self, K, sampling, used):
-        """`Sets` that hold between the configurations, too, from gains K (1 or k, n, 3n + 2m) that hold in them."""
+        """`Sets` for all loops in and between the configurations.
+
+        The search starts from gains K (1 or k, n, 3n + 2m) for the loops in the configurations alone.
+        """
         loops, weights = self.held(sampling, len(K))
         search = whole = self.search_of(loops, weights, sampling)
         x, relaxed = whole.slowest.scaled(K), set()
@@ -650,7 +660,7 @@ class Task:
         return self.sets(whole, x, used)
 
     def from_nearby(self, progress, found):
-        """The best of what the search reaches from the gains that were `found` and nearby, see `nearby`."""
+        """The best `Sets` that the search reaches from the gains `found` and from gains near them, see `nearby`."""
         loops, weights = self.held(found.sampling, len(found.K))
         whole = self.search_of(loops, weights, found.sampling)
         x, used = whole.slowest.scaled(found.K), found.evaluations
@@ -664,18 +674,18 @@ class Task:
         return self.sets(whole, x, used + whole.evaluations)
 
     def held(self, sampling, count):
-        """Loops at and between the configurations, and the weights of `count` sets of gains in each."""
+        """Loops in and between the configurations, and the weights of `count` sets of gains in each loop."""
         return held_loops(self.nominal, self.at, sampling, self.uncertainty, count)
 
     def search_of(self, loops, weights, sampling):
-        """The `Search` for sets of gains, of which each of the loops has the mean with `weights` of its own."""
+        """The `Search` for sets of gains; each loop has their mean, weighted with its own `weights`."""
         wanted = self._wanted(sampling.torque_corner)
         slowest = SlowestScheduled(loops, wanted, self.scale, weights)
         noise = Noise(slowest, self.nominal, sampling, self.speed * NOISIEST, self.omega_1)
         return Search(slowest, noise, self.speed * FASTEST, sampling=sampling)
 
     def _wanted(self, corner):
-        """What is asked of poles when the torque passes a low pass of a `corner`."""
+        """What is asked of poles when the torque passes a low pass with this `corner` [rad/s]."""
         reach = min(self.wanted.omega_c, corner) if self.short else self.wanted.omega_c
         return replace(self.wanted, omega_c=reach)
 
@@ -687,7 +697,10 @@ class Task:
         return [(search, [*starts, search.slowest.scaled(gains)]) for search, starts in found]
 
     def _search(self, factor, at, first=1):
-        """The search with a low pass of a corner over omega_1, in configurations from number `first` on; its starts."""
+        """The search with a low pass, its corner `factor` times omega_1, and its starts.
+
+        The configurations are numbered from `first` on.
+        """
         corner = factor * self.omega_1
         samples = replace(self.sampling, torque_corner=corner)
         loops = uncertain_loops(self.nominal, at, samples, self.uncertainty, first)
@@ -741,7 +754,10 @@ class Task:
 
 
 def units(model, at, omega_1):
-    """Unit of each gain, (n, 3n + 2m): what moves joints and modes at about omega_1; 0 where there is no gain."""
+    """Unit of each gain, (n, 3n + 2m); 0 where there is no gain.
+
+    Gains of this size move joints and modes at about omega_1.
+    """
     n, m = model.n_joints, model.n_modes
     out = np.zeros((n, 3 * n + 2 * m))
     for q in at:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search that goes on from gains that hold, for gains with which motions leave less behind."""
+"""A further search, from gains that are stable, for gains with which motions leave less behind."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -7,46 +7,47 @@ from typing import NamedTuple
 from .loop import ARM, MARGIN
 from .settling import AfterMotion, residuals
 
-#: The slowest pole of all loops keeps this part of the decay that was reached, and no less than the second number. If
-#: it had less than that, it keeps all of it [-].
+#: The slowest pole of all loops keeps the fraction `KEEP` of the decay that was reached, and at least `LEAST`. If its
+#: decay was less than `LEAST`, it keeps all of it [-].
 KEEP, LEAST = 0.8, 0.05
-#: The search takes fewer evaluations for more configurations than these.
+#: With more configurations than this, the search takes fewer evaluations.
 PLACES = 3
-#: Its gains are not taken if, where joints rub, the slowest pole that rings loses more than this part of its decay, and
-#: then has less than this times the speed (over omega_1). Such gains make J smaller, but simulated arms settle later.
+#: New gains are not taken if, in loops whose joints friction damps, the slowest pole that rings loses more than the
+#: fraction `SHORTER` of its decay and then has less than `RINGS` times the speed (over omega_1). Such gains make J
+#: smaller, but simulated arms settle later.
 SHORTER, RINGS = 0.1, 0.03
 
 
 class Further(NamedTuple):
-    """A search for gains that leave less, and when it is made."""
+    """A search for gains with which motions leave less, and when it is made."""
 
-    much: float  # J of `settling.AfterMotion` above which it is made, if full speed was asked [-]
-    enough: float  # J at which it ends, likewise [-]
+    much: float  # J of `settling.AfterMotion` from which the search is made, for a requested speed of 1 [-]
+    enough: float  # J at which the search ends, likewise [-]
     evaluations: int  # at most
-    eased: float  # part of what was asked that loops are asked that are there for a margin [-]
+    eased: float  # factor of the decay that is asked of loops for a margin [-]
 
 
-#: The first one that applies. Where motions leave very much, margins are paid for it.
+#: The first one that applies is used. If motions leave very much behind, part of the margins is given up in return.
 FURTHER = (Further(3.5, 2.1, 800, 0.5), Further(2.0, 0.9, 400, 1.0))
 
 
 def leaving_less(task, found, progress, speed=None):
-    """Gains near those that were found with which motions leave less behind, where these leave much.
+    """If motions leave much behind: gains near the `found` ones with which they leave less.
 
     Parameters
     ----------
     task : design.Task
     found : design.Sets
-        They hold.
+        With stable loops.
     progress : callable
-        Called with a fraction of the work, and the decay that was found.
+        Called with the fraction of the work that is done, and the decay of `found`.
     speed : float, optional
-        That was asked, from which the task's may have been lowered; the task's if not given [-].
+        The requested speed, if the task has a lower one; the task's if not given [-].
 
     Returns
     -------
     design.Sets or None
-        None if nothing is searched, or nothing better found.
+        None if no search is made, or it finds nothing better.
     """
     loops, weights = task.held(found.sampling, len(found.K))
     whole = task.search_of(loops, weights, found.sampling)
@@ -68,7 +69,7 @@ def leaving_less(task, found, progress, speed=None):
         for one, part in zip(loops, _parts(loops, decays, chosen.eased), strict=True)
     ]
     search = task.search_of(eased, weights, found.sampling)
-    # A pole that hardly moves with the gains counts where less is asked of it.
+    # If less is asked of a loop, v and its gradient are larger: a pole may count that did not move enough before.
     reached = min(decays + search.decays(x))
     if reached <= 0.0:
         return None
@@ -88,10 +89,10 @@ def leaving_less(task, found, progress, speed=None):
 
 
 def later(now, before):
-    """Whether an arm settles later under its torque limits, by the `Recovery` with some gains and with those before.
+    """Whether, under its torque limits, an arm settles later with the new gains (`now`) than with the old (`before`).
 
-    J is without limits. Where the two contradict each other, the gains are not taken; nor are they if the arm came back
-    from its limits before and does not now.
+    J does not include the limits, so J may be smaller and this time longer. In that case the new gains are not taken.
+    They are not taken either if the arm came back from its limits before and does not now.
     """
     if now is None or before is None:
         return False
@@ -99,20 +100,20 @@ def later(now, before):
 
 
 def _kept(reached):
-    """The least decay that the search keeps, of the least that was `reached` [-]."""
+    """The least decay that the search may leave, from the least one that was `reached` [-]."""
     return max(KEEP * reached, min(reached, LEAST))
 
 
 def _rings_longer(now, before, speed):
-    """Whether the slowest decays that ring, where joints rub, are a reason not to take gains [-]."""
+    """Whether gains are refused for ringing; `now` and `before` are decays of `AfterMotion.ringing` [-]."""
     return now < min(before - SHORTER * abs(before), RINGS * speed)
 
 
 def _parts(loops, decays, eased):
-    """Of the decay that each loop is asked, the part that is asked of it in the search.
+    """Factors of the decay that is asked of each loop in the search.
 
-    `eased` of loops that are there for a margin. A loop of the moving arm keeps `LEAST`, or what it has, also where the
-    slowest of all loops is slower.
+    The factor is `eased` for loops for a margin. A loop of kind `ARM` keeps `LEAST`, or its own decay if that is less,
+    even if the slowest of all loops is slower.
     """
     keep = _kept(min(decays))
     for loop, own in zip(loops, decays, strict=True):

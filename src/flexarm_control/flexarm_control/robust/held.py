@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where gains have to hold: in the configurations of a design, and on the way between them.
+"""Where the loops must be stable: in the configurations of a design, and on the way between them.
 
-Gains that hold in a few configurations need not hold between them: the modes that a late torque turns by more than a
-right angle change their phase from place to place. So the loops of an arm in several configurations are those of the
-configurations and of places between the first and each of the others, each with the mean of the sets of gains that the
-control has there (`flexarm_control.schedule`).
+Gains that are stable in a few configurations may be unstable between them: the modes for which the torque's delay is a
+phase lag of more than 90 degrees change their phase from place to place. So the set has the loops in each
+configuration, and at places between the first configuration and each of the others. Each loop has the weighted mean of
+the sets of gains that the control has at that place (`flexarm_control.schedule`).
 """
 
 from dataclasses import replace
@@ -14,12 +14,14 @@ import numpy as np
 from ..schedule import Schedule
 from .uncertain import rests, uncertain_loops
 
-#: Places on the way from the first configuration to each of the others, in parts of it [-].
+#: Places on the way from the first configuration to each of the others, as fractions of the way [-].
 BETWEEN = (0.33, 0.67)
 
 
 def places(nominal, at, count):
-    """Where `count` sets of gains have to hold: the configurations first, then between them, where the arm rests.
+    """Places where loops with `count` sets of gains must be stable: first the configurations, then between them.
+
+    Between the configurations, places where the arm does not rest are left out.
 
     Parameters
     ----------
@@ -45,7 +47,7 @@ def places(nominal, at, count):
 
 
 def held_loops(nominal, at, sampling, uncertainty, count=1):
-    """The loops of all `places`, and the weights of the sets of gains in each.
+    """The loops at all `places`, and the weights of the sets of gains in each loop.
 
     Parameters
     ----------

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Limit cycles that play in a transmission makes likely, by the describing function of its dead zone.
+r"""Limit cycles that are likely because of play in a transmission, by the describing function of its dead zone.
 
-A deflection of amplitude A about the middle of a play of :math:`\pm p` meets, in the first harmonic, the fraction
+For a deflection of amplitude A about the middle of a play of :math:`\pm p`, the first harmonic of the spring's force is
+that of a spring with the fraction
 
 .. math:: N(A) = 1 - \frac{2}{\pi}\Bigl(\arcsin\frac pA + \frac pA\sqrt{1-\frac{p^2}{A^2}}\Bigr), \qquad A > p
 
-of the spring's stiffness (and of its damper, which takes hold with it). The loop oscillates where, with this fraction,
-it has poles on the unit circle: the harmonic balance of the sampled loop, filters and delay included. The oscillation
-keeps its amplitude where a larger one decays, that is, where the loop is unstable below this fraction and stable
-above. It is likely only where smaller ones also grow fast: a link in its play drifts, and what hardly grows is damped
-by friction. Harmonics are left out: frequency and amplitude are right within some ten percent.
+of the stiffness. The same fraction applies to the spring's damper, which acts only together with it. The loop
+oscillates if it has poles on the unit circle with this fraction. This is the harmonic balance of the sampled loop,
+filters and delay included. The oscillation keeps its amplitude if a larger one decays, that is, if the loop is unstable
+below this fraction and stable above. It is likely only if smaller oscillations also grow fast: a link in its play
+drifts, and friction damps an oscillation that hardly grows. Higher harmonics are left out: frequency and amplitude are
+right within some ten percent.
 """
 
 from dataclasses import dataclass
@@ -19,16 +21,16 @@ from scipy.optimize import brentq
 
 from flexarm_dynamics.linear import softened, state_at_rest
 
-#: Fractions of the stiffness that are looked at, and the least frequency of an oscillation, in parts of the sampling's.
+#: Fractions of the stiffness that are tried, and the least frequency of an oscillation over the sampling frequency.
 FRACTIONS, SLOWEST = np.geomspace(1.0, 0.05, 30), 1e-4
-#: Least negative damping ratio at half the fraction of a limit cycle that counts as likely [-].
+#: A limit cycle is likely if, at half its fraction, the oscillation has at least this negative damping ratio [-].
 MIN_GROWTH = 0.01
 #: Bisections of the fraction at which a pole crosses the unit circle.
 BISECTIONS = 30
 
 
 def describing_function(amplitude, half):
-    """N(A) of a dead zone of +- `half` [rad]: 0 within it."""
+    """N(A) of a dead zone of +- `half` [rad]; 0 for an amplitude within it."""
     if amplitude <= half:
         return 0.0
     ratio = half / amplitude
@@ -47,7 +49,7 @@ class LimitCycle:
     amplitude : float
         Of the link's deflection against the motor [rad].
     load : float
-        That presses the flanks at rest [N m]: while the oscillation's torque is less, they don't part.
+        Torque that presses the flanks together at rest [N m]; they do not part while the oscillation's torque is less.
     """
 
     joint: str
@@ -57,7 +59,7 @@ class LimitCycle:
 
     @property
     def text(self):
-        """A line for people."""
+        """One line of text for the user."""
         start = ""
         if self.load > 0.0:
             start = f"; the load of {self.load:.3g} N m keeps the flanks together until more than that shakes them"
@@ -69,7 +71,7 @@ class LimitCycle:
 
 
 def limit_cycles(plant, q, A, poles, period):
-    """Limit cycles of a loop, one for each joint at most.
+    """Limit cycles of a loop, at most one for each joint.
 
     Parameters
     ----------
@@ -80,9 +82,9 @@ def limit_cycles(plant, q, A, poles, period):
     A : ndarray
         Of the plant at rest there, as `linear_plant` gives it.
     poles : callable
-        From another A to the poles z of the sampled loop.
+        Takes a changed A, and returns the poles z of the sampled loop.
     period : float
-        [s]
+        Of the samples [s].
 
     Returns
     -------
@@ -96,7 +98,7 @@ def limit_cycles(plant, q, A, poles, period):
         place = plant.n_joints + plant.mode_names.index(f"{joint.name}_transmission")
 
         def oscillating(fraction, place=place, gear=joint.transmission):
-            """Largest pole that oscillates."""
+            """The pole with the largest modulus of those that oscillate."""
             z = poles(softened(plant, q, A, place, gear, fraction)).astype(complex)
             z = z[np.abs(np.angle(z)) > 2.0 * np.pi * SLOWEST]
             return z[np.argmax(np.abs(z))]
@@ -119,7 +121,10 @@ def limit_cycles(plant, q, A, poles, period):
 
 
 def _crossing(oscillating):
-    """The largest fraction at which a loop that is stable above becomes unstable, and the pole there; else None."""
+    """The largest fraction below which the loop is unstable and above which it is stable, and the pole there.
+
+    None if the loop is unstable with closed play, or stable at all `FRACTIONS`.
+    """
     stable = None
     for fraction in FRACTIONS:
         grows = abs(oscillating(fraction)) > 1.0

@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""One sampled loop of an uncertain set: an arm at rest in a configuration, its sensors, filters and delay.
 
-The arm (2), linear about rest, moves from sample to sample by Phi and Gamma (`full_order`). The control measures
-joint positions and, through the strain map of the arm *file*, modal amplitudes, :math:`y = Cs`; modes that the arm has
-beyond the file's leak into them. Rates are filtered derivatives with the corners of `observer.bandwidth` and
+The arm (2), linear about rest, moves from sample to sample by Phi and Gamma (`full_order`). The control measures joint
+positions and, through the strain map of the arm *file*, modal amplitudes, :math:`y = Cs`. Modes that the arm has beyond
+the file's leak into these amplitudes. Rates are filtered derivatives with the corners `observer.bandwidth` and
 `observer.joint_velocity_bandwidth`, as the observer computes them,
 
 .. math::
     r_k = d_k + (r_{k-1} - d_k)\,\kappa, \qquad d_k = (y_k - y_{k-1})/h, \qquad \kappa = e^{-\omega_c h} .
 
-Each is a filter of first order, with one state f in place of the two of the last sample,
+Each is a first-order filter. It needs only one state f in place of the last y and r,
 
-.. math:: r_k = f_{k-1} + \sigma y_k, \qquad f_k = \kappa r_k - \sigma y_k, \qquad \sigma = (1 - \kappa)/h :
+.. math:: r_k = f_{k-1} + \sigma y_k, \qquad f_k = \kappa r_k - \sigma y_k, \qquad \sigma = (1 - \kappa)/h .
 
-the poles are the same but for those at z = 0, and fewer states cost less. The integral is that of the slow law,
-:math:`w_k = w_{k-1} - h\,q_{k-1}`, and torques are under way for the delay. The feedback's torque passes two filters of
-first order with the corner of `slow.bandwidth` and `fast.bandwidth` (`flexarm_control.low_pass`). With the state X of
-all of this, and the control :math:`u = -K\,m`,
+The poles are the same except those at z = 0, and fewer states take less time. The integral is that of the slow law,
+:math:`w_k = w_{k-1} - h\,q_{k-1}`. A torque acts after the delay. The feedback's torque passes two first-order filters
+with the corner `slow.bandwidth` and `fast.bandwidth` (`flexarm_control.low_pass`). With the state X of all of this, and
+the control :math:`u = -K\,m`,
 
 .. math:: X_{k+1} = F X_k + G u_k, \qquad m = N X = (q, r_q, -w, \hat\delta, r_\delta) .
 
-What leaves the filters and is sent is :math:`v_k = V X_k + D u_k`. If a limit changes it by :math:`\Delta v`, this adds
-:math:`E\,\Delta v` to the next state (`Loop.sent`, `through`, `effect`).
+The torque after the filters, which is sent, is :math:`v_k = V X_k + D u_k`. If a limit changes it by :math:`\Delta v`,
+this adds :math:`E\,\Delta v` to the next state (`Loop.sent`, `through`, `effect`).
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ from flexarm_dynamics.linear import linear_plant, sampled
 
 from ..low_pass import POLES, LowPass
 
-#: What a `Loop` stands for: an arm as it may be; a margin of gain, delay or modes; an arm whose joints stick.
+#: Kind of a `Loop`: an arm within the uncertainty; a margin of gain, delay or modes; an arm whose joints stick.
 ARM, MARGIN, STICKS = "arm", "margin", "sticks"
 
 
@@ -45,13 +45,13 @@ class Sampling:
     period: float  # h [s]
     delay: float  # from the measurement to the torque [s]
     joint_corner: float  # of the filtered derivative of joint positions [rad/s]; infinite: speeds are measured
-    modal_corner: float  # of that of modal amplitudes [rad/s]
+    modal_corner: float  # of the filtered derivative of modal amplitudes [rad/s]
     torque_corner: float = np.inf  # of the feedback's low pass; infinite: none [rad/s]
-    friction: tuple = (0.0,)  # part of each joint's Coulomb friction that is cancelled [-]
+    friction: tuple = (0.0,)  # fraction of each joint's Coulomb friction that is cancelled [-]
     return_rate: float = 0.0  # see `slow.joint_pid` [1/s]
     breakaway: tuple = (
         0.0,
-    )  # part of each joint's Coulomb friction that is overcome where it sticks [-]
+    )  # fraction of each joint's Coulomb friction that is overcome where it sticks [-]
     breakaway_rate: float = 0.0  # see `slow.joint_pid` [1/s]
 
 
@@ -64,11 +64,11 @@ class Loop:
     G: np.ndarray  # (N, n)
     N: np.ndarray  # (3n + 2m, N): measurements
     period: float
-    fraction: float = 1.0  # of the decay that is asked of it [-]
-    kind: str = ARM  # what it stands for
-    sent: np.ndarray | None = None  # (n, N): with through, the torque that is sent
-    through: np.ndarray | None = None  # (n, n)
-    effect: np.ndarray | None = None  # (N, n): what a change of the sent torque does
+    fraction: float = 1.0  # fraction of the decay that is asked of it [-]
+    kind: str = ARM  # ARM, MARGIN or STICKS
+    sent: np.ndarray | None = None  # V, (n, N): the torque that is sent is V X + D u
+    through: np.ndarray | None = None  # D, (n, n)
+    effect: np.ndarray | None = None  # E, (N, n): of a change of the sent torque on the next state
 
 
 def measured_amplitudes(nominal, plant):
@@ -89,15 +89,16 @@ def sampled_loop(
         [rad]
     sampling : Sampling
     gain : float
-        Of the torque on its way to the arm [-].
+        Factor of the torque on its way to the arm [-].
     name : str
         Of the loop.
     fraction : float
-        Of the decay that is asked of it [-].
+        Fraction of the decay that is asked of the loop [-].
     sticking : float
-        Coulomb friction as a damper: 1.0 as steep as at rest, less as a larger movement meets it, 0.0 none [-].
+        Coulomb friction as a damper, over the damper that it is at rest: 1.0 at rest, less for larger movements, 0.0
+        without friction [-].
     kind : str
-        What the loop stands for: `ARM` or `MARGIN`; with `sticking` it is `STICKS`.
+        Kind of the loop: `ARM` or `MARGIN`; with `sticking` it is `STICKS`.
     """
     n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
     A, B = _plant(plant, np.asarray(q, float), sticking)
@@ -133,7 +134,7 @@ def sampled_loop(
         rate[:n] = 0.0
         rate[:n, n + mp : size] = encoder_rows(plant)
     later, end = sampled(A, B, h - late)
-    # What the low pass gives now, of the state and of u.
+    # Output of the low pass in this sample, by the state and by u.
     out, through = np.zeros((n, total)), np.eye(n)
     if poles:
         passed = slice(at_v, at_u)
@@ -178,7 +179,7 @@ def sampled_loop(
 
 
 def _plant(plant, q, sticking):
-    """A and B of the `plant` at rest with a part of its Coulomb friction's damper at rest, see `sampled_loop`."""
+    """A and B of the `plant` at rest, with the fraction `sticking` of the damper of Coulomb friction at rest."""
     A, B = linear_plant(plant, q, coulomb=False)
     if not sticking:
         return A, B

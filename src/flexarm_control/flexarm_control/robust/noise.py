@@ -9,12 +9,12 @@ from ..low_pass import POLES
 
 #: Joint and strain noise assumed where the file states none [rad], [-].
 ENCODER_NOISE, STRAIN_NOISE = 1.5e-5, 1e-6
-#: So many samples of a response to noise are looked at.
+#: Number of samples of the impulse response of the filters.
 SAMPLES = 4096
 
 
 class Noise:
-    """Torque that sensor noise makes, over the torque limit, and the penalty for too much of it.
+    """Torque due to sensor noise, over the torque limit, and the penalty for too much of it.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ class Noise:
     model : ArmModel
     sampling : Sampling
     allowed : float
-        [-]
+        Rms torque of the noise over the limit from which the penalty begins [-].
     omega_1 : float
         [rad/s]
     """
@@ -65,9 +65,9 @@ class Noise:
 
 
 def _passed(sampling, corner):
-    """White noise of a signal behind the torque's low pass, over that of the signal.
+    """Rms noise after the torque's low pass, over the rms of a signal's white noise.
 
-    `corner` [rad/s]: of a filtered derivative [1/s]; None: of the signal itself [-].
+    With a `corner` [rad/s], the signal first passes a filtered derivative [1/s]; with None it does not [-].
     """
     from scipy.signal import lfilter  # with scipy.stats a third of a node's start
 

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Minimisation of a function that has kinks, by BFGS with a weak Wolfe line search.
 
-The method of Lewis and Overton (2013), Nonsmooth optimization via quasi-Newton methods, Mathematical Programming 141:
-on functions such as the slowest pole of a set of loops, BFGS goes on beyond the kinks where gradient descent and trust
-regions stop, provided that the line search asks for a weak Wolfe condition alone.
+This is the method of Lewis and Overton (2013), Nonsmooth optimization via quasi-Newton methods, Mathematical
+Programming 141. On functions such as the slowest pole of a set of loops, gradient descent and trust regions stop at
+kinks. BFGS goes on beyond them, provided that the line search requires only the weak Wolfe conditions.
 """
 
 import numpy as np
 
 #: Constants of the weak Wolfe conditions.
 DECREASE, CURVATURE = 1e-4, 0.5
-#: Bisections of one line search, and the shortest step.
+#: Maximum number of points in one line search, and the shortest step.
 BISECTIONS, SHORTEST = 40, 1e-9
-#: A search ends when so many steps have brought less than this fraction of the value.
+#: A search ends when this many steps have improved the value by less than this fraction.
 STALE, LITTLE = 30, 1e-3
 
 
@@ -22,11 +22,11 @@ def minimise(function, x, evaluations, enough=None):
     Parameters
     ----------
     function : callable
-        Takes x, returns the value and the gradient; an infinite value is out of bounds.
+        Takes x, returns the value and the gradient; where the value is infinite, x is out of bounds.
     x : ndarray
-        Where to begin; the value there is finite.
+        Where to begin; the value there must be finite.
     evaluations : int
-        At most about so many.
+        Approximate maximum number of evaluations.
     enough : callable, optional
         Takes the value; True ends the search.
 
@@ -68,7 +68,10 @@ def minimise(function, x, evaluations, enough=None):
 
 
 def _line_search(function, x, value, direction, slope):
-    """A point, its value and gradient with the weak Wolfe conditions, or the best found; and evaluations used."""
+    """A point that satisfies the weak Wolfe conditions, with value and gradient; and the evaluations used.
+
+    If no such point is found, it is the last one that satisfies the first condition, or None.
+    """
     low, high, t, best, used = 0.0, np.inf, 1.0, None, 0
     length = np.linalg.norm(direction)
     for _ in range(BISECTIONS):

@@ -1,23 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Whether an arm comes to rest after a motion that takes nearly all the torque it has.
+r"""Whether an arm comes to rest after a motion that takes nearly all of its torque.
 
-Where a torque is at its limit, less is fed back than the gains ask for. A loop that is stable with its gains, and with
-any fixed part of them, may swing up there: fast gains ask for much torque. So the loops of the heaviest payload are
-followed with the torque limits of the arm file. All joints move at once in the time of `settling`, from one
-configuration of the design towards another (of a single configuration: all joints alike), so far that the feed-forward
-for the arm of the file takes `SHARE` of the limits, or a joint has the largest speed it may have. The feed-forward's
-torque is :math:`u_m`, the file's weight included. The feedback is y, after the filters, with the rest :math:`u_h` of
-the heavier weight, which the integral holds. What is sent is v, as `saturation: together` sends it,
+At a torque limit the feedback is weaker than the gains demand. A loop that is stable with its gains, and with any fixed
+fraction of them, may still oscillate with growing amplitude there, since fast gains demand much torque. So the loops
+with the heaviest payload are simulated with the torque limits of the arm file. All joints move at once in the time of
+`settling`, in the direction from one configuration of the design to another (with a single configuration: all joints
+alike). The motion is so large that the feed-forward for the arm of the file takes the fraction `SHARE` of the limits,
+or that a joint reaches its velocity limit. The torque of the feed-forward is :math:`u_m`; it includes the file's
+weight. The feedback after the filters is y. It includes :math:`u_h`, the additional weight of the heavier payload at
+rest, which the integral holds. The torque that is sent is v, as `saturation: together` sends it,
 
 .. math:: y_k = u_h + (V - DKN)\,X_k, \qquad
     v_k = u_m + \min_i\Bigl(1, \frac{\pm u_{max,i} - u_{m,i}}{y_{k,i}}\Bigr)\,y_k ,
 
-and at most :math:`u_{max}`. The integral of a joint that is pushed further is held (`slow.joint_pid`). With V, D and E
-of `loop`,
+and at most :math:`u_{max}`. If the integral of a joint would push it further beyond its limit, it is held
+(`slow.joint_pid`). With V, D and E of `loop`,
 
 .. math:: X_{k+1} = (F - GKN)\,X_k + S f_k + E\,(v_k - u_m - y_k) .
 
-Left out are friction, the limit of the torque's rate, and that of the integral.
+Friction, the limit of the torque's rate, and the limit of the integral are left out.
 """
 
 from dataclasses import dataclass
@@ -35,28 +36,28 @@ from .settling import ANGLE, MOTION, TOLERANCE, Motion
 from .tip import Tip
 from .uncertain import richer
 
-#: Part of the torque limits that the motion takes [-].
+#: Fraction of the torque limits that the motion takes [-].
 SHARE = 0.9
 #: Largest speed of a quintic over its mean speed [-].
 PEAK = 1.875
-#: The tip is looked at for so many locked periods after the motion.
+#: The tip is watched for this many locked periods after the motion.
 WATCHED = 8.0
-#: An arm does not come back where the limits make it settle by more than so many locked periods later.
+#: An arm does not come back from its limits if they make it settle more than this many locked periods later.
 LATER = 2.0
-#: Directions whose angle has a larger cosine than this are one.
+#: Two directions count as one if the cosine of the angle between them is larger than this.
 ALIKE = 0.99
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """Times until the tip has settled after such motions, in locked periods; infinite: not while watched.
+    """Times until the tip has settled after such motions, in locked periods; infinite: not within `WATCHED`.
 
     Attributes
     ----------
     limited, unlimited : float
-        The longest with the arm file's torque limits, and the longest without any.
+        The longest with the arm file's torque limits, and the longest without limits.
     later : float
-        By how much the limits make it longer, of the motion with the largest difference.
+        The largest increase of this time by the limits, of all motions.
     """
 
     limited: float
@@ -65,9 +66,9 @@ class Recovery:
 
     @classmethod
     def of(cls, pairs):
-        """That of motions whose times with and without limits are `pairs`; None if there are none.
+        """The `Recovery` for `pairs` of times with and without limits, one per motion; None if there are no pairs.
 
-        Where the tip does not settle without limits, these are not what is in the way.
+        If the tip does not settle without limits either, the limits are not the cause, and the increase counts as 0.
         """
         if not pairs:
             return None
@@ -77,14 +78,15 @@ class Recovery:
 
     @property
     def comes_back(self):
-        """Whether the limits make it settle at most `LATER` later."""
+        """Whether the limits make the tip settle at most `LATER` later."""
         return self.later <= LATER
 
 
 def recovery(nominal, at, sampling, uncertainty, sets):
     """The `Recovery` of an arm with its heaviest payload.
 
-    None if the links do not bend, a joint has no torque limit, or the weight alone takes the torque everywhere.
+    None if the links do not bend, if a joint has no torque limit, or if in every configuration the weight leaves no
+    torque for a motion or the arm does not rest.
 
     Parameters
     ----------
@@ -111,7 +113,7 @@ def recovery(nominal, at, sampling, uncertainty, sets):
             forces, push = motion.leaves(plant, sampling.period)
             weight = static_torque(model, q)
             heavier = static_torque(plant, q) - weight
-        except ModelError:  # heavier than what rests there
+        except ModelError:  # too heavy to rest there
             continue
         after = int(np.ceil(WATCHED * period / sampling.period))
         tip = Tip(plant, q).J / (TOLERANCE * arm.reach)
@@ -128,18 +130,18 @@ def recovery(nominal, at, sampling, uncertainty, sets):
 
 
 def _part(torque, room, way, fastest, period):
-    """By what the motion is multiplied; below zero where there is no `room` for it.
+    """Factor of the motion; below zero if there is no `room` for it.
 
     Parameters
     ----------
     torque : ndarray, shape (k, n)
         Of the motion [N m].
     room, fastest : ndarray, shape (n,)
-        Torques [N m] and speeds [rad/s] that it may have.
+        Largest torques [N m] and speeds [rad/s] that the motion may have.
     way : ndarray, shape (n,)
-        Of the joints, in `settling.ANGLE`.
+        Angle by which each joint moves, over `settling.ANGLE`.
     period : float
-        [s]
+        Of the lowest mode, joints locked [s].
     """
     with np.errstate(divide="ignore"):
         by_torque = room / np.abs(torque).max(axis=0)
@@ -148,7 +150,7 @@ def _part(torque, room, way, fastest, period):
 
 
 def _ways(at, both):
-    """Unit vectors (n,) from each configuration to the others, each direction once; `both`: and back again."""
+    """Unit vectors (n,) between the configurations, each direction once; `both`: their opposites as well."""
     out = []
     for i, a in enumerate(at):
         for b in at[:i]:
@@ -168,13 +170,13 @@ class _Limited:
     loop : Loop
     K : ndarray, shape (n, 3n + 2m)
     push : ndarray, shape (s, h)
-        What a force does to the plant's state in one sample.
+        Change of the plant's state in one sample by a unit of each force.
     tip : ndarray, shape (3, h)
         Jacobian of the tip by joints and deflections, over the tolerance.
     held : ndarray, shape (n,)
-        Torque that is fed back at rest [N m].
+        Torque of the feedback at rest [N m].
     after : int
-        Samples that are looked at after a motion.
+        Number of samples that are simulated after a motion.
     """
 
     def __init__(self, loop, K, push, tip, held, after):
@@ -189,14 +191,14 @@ class _Limited:
         self._C[:, : tip.shape[1]] = tip
 
     def settling(self, forces, torque, weight, limit):
-        """Time from the end of a motion until the tip has settled [s].
+        """Time from the end of a motion until the tip has settled [s]; infinite: not in the samples after it.
 
         Parameters
         ----------
         forces : ndarray, shape (k, h)
-            Left to the feedback.
+            That the feed-forward leaves to the feedback.
         torque : ndarray, shape (k, n)
-            Of the motion, weight included; after it the `weight` (n,) [N m].
+            Of the motion, weight included; after the motion it is the `weight` (n,) [N m].
         limit : ndarray, shape (n,)
             [N m]
         """
@@ -207,7 +209,7 @@ class _Limited:
         return np.inf if outside[-1] == self._after else float(self._period * (outside[-1] + 1))
 
     def states(self, forces, torque, weight, limit):
-        """X of all samples, from rest on, (k + after + 1, N)."""
+        """X of all samples, beginning at rest, (k + after + 1, N)."""
         count = len(forces) + self._after
         pushes = np.zeros((count, len(self._A)))
         pushes[: len(forces), : len(self._push)] = forces @ self._push.T

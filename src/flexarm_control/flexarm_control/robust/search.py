@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search for the gains whose slowest pole is the fastest."""
+"""The search for the gains that make the slowest pole as fast as possible."""
 
 from dataclasses import replace
 
@@ -8,41 +8,45 @@ from scipy.linalg import eigh
 
 from .nonsmooth import minimise
 
-#: Starts: natural frequency of the joints over omega_1, times the speed. From stiffer ones a search for a slow design
-#: ends at once, with gains that ask for much torque.
+#: Starts: natural frequency of the joints over omega_1 and over the speed. From stiffer starts the search for a slow
+#: design ends at once, with gains that ask for much torque.
 STARTS = (0.5, 0.15)
 #: Weight of the gains' size against the slowest pole.
 SMALL_GAINS = 1e-6
 #: Widths of the smooth maximum, one after the other.
 WIDTHS = (0.3, 0.1, 0.03, 0.01)
-#: Evaluations of one descent, until the loops are chosen anew.
+#: Evaluations of one descent, before the loops are chosen again.
 DESCENT = 60
 #: Evaluations of all loops for each start, then for the best start of each search, then for the best of all.
 FIRST, MIDDLE, LAST = 80, 120, 320
-#: The same for gains at and between several configurations together, in each of so many rounds: after each, loops whose
-#: decay is within this factor of the least are asked this part from then on.
+#: Evaluations for gains in and between several configurations together, in each round, and the number of rounds. After
+#: a round, the loops whose decay is within the third number, a factor, of the least decay are relaxed: from then on the
+#: fourth number, a fraction of the decay, is asked of them.
 TOGETHER, ROUNDS, NEAR, RELAXED = 120, 3, 1.15, 0.4
-#: Evaluations of all loops from each start nearby, and how far these are from the best, in parts of each gain [-].
+#: Evaluations of all loops from each start near the best gains, and the standard deviation of these starts from the
+#: best, relative to each gain [-].
 AGAIN, APART = 240, 0.1
-#: So many of them in a row may bring less than this fraction: then there are no more.
+#: After this many such starts in a row that each improve the value by less than this fraction, there are no more.
 PATIENCE, MORE = 3, 0.01
-#: Loops with more states get fewer evaluations.
+#: Loops with more states than this get fewer evaluations.
 SIZE = 65
-#: What motions leave behind: width of the smooth maximum of the poles; weight of the square of what the decay is below
-#: the least, over that; and by how much more than the least is aimed at, since such a penalty leaves a little less.
-#: (Where poles meet, their slopes have no bound: a penalty in proportion ended searches.)
+#: For the search that reduces what motions leave behind (`Search.sooner`): `NARROW` is the width of the smooth maximum
+#: of the poles. `STEEP` is the weight of the penalty, the square of the shortfall of the decay over the least allowed
+#: decay. `AIM` is the decay at which the search aims, over the least allowed one: with such a penalty the decay ends
+#: slightly below the aim. (Where poles meet, their gradients have no bound. With a penalty proportional to the
+#: shortfall, searches ended there.)
 NARROW, STEEP, AIM = 0.003, 500.0, 1.02
-#: Gains have to leave less than this part of what the others leave: linear loops predict it no better. Progress is
-#: reported after so many evaluations.
+#: New gains are taken only if they leave less than this fraction of what the old ones leave: linear loops do not
+#: predict smaller differences. Progress is reported each time after this many evaluations.
 TAKEN, REPORTED = 0.85, 20
-#: A width goes on for as long as it gains this fraction.
+#: The search goes on with a width as long as a descent improves the value by at least this fraction.
 GAIN = 0.02
 
 
 class Search:
-    """Minimises the slowest pole of a set of loops, its noise penalised.
+    """Minimises the value of the slowest pole of a set of loops, with a penalty for noise.
 
-    A descent is on the few loops that are the worst, to which the worst of the others are added until none is worse.
+    A descent considers only the few worst loops. Then the worst of the others are added, until none of them is worse.
 
     Parameters
     ----------
@@ -51,14 +55,14 @@ class Search:
     enough : float
         Decay at which a search ends [-].
     handicap : float
-        Its decay counts as divided by this beside that of other searches [-].
+        The decay is divided by this before it is compared with that of other searches [-].
     sampling : Sampling
         Of its loops.
 
     Attributes
     ----------
     evaluations : float
-        So many times all loops were looked at.
+        Number of evaluations so far, in evaluations of all loops.
     """
 
     def __init__(self, slowest, noise, enough, handicap=1.0, sampling=None):
@@ -95,27 +99,28 @@ class Search:
         return best
 
     def value(self, x):
-        """The slowest pole of all loops, with the penalties."""
+        """The value of the slowest pole of all loops, plus the penalties."""
         return self._with_penalty(self._each(x), x)
 
     def decays(self, x):
-        """Decay of the slowest pole of each loop that gains move, a list; infinite where they move none [-]."""
+        """For each loop, the decay of the slowest pole that gains move, as a list; infinite if they move none [-]."""
         return [-value for value in self._each(x)]
 
     def relaxed(self, x, kept=(), least=0.0):
-        """The loops, of which those that limit the others are asked less, and their numbers; without loops at an end.
+        """All loops, with less asked of those that limit the decay, and the numbers of the latter.
 
-        The slowest pole of all decides what a search looks for. Where a mode that torque hardly moves or a joint that
-        sticks is the slowest, all others would be left as slow.
+        A search improves only the slowest pole of all. If that is a mode that torque hardly moves or a joint that
+        sticks, all others would stay as slow. None in place of the loops: there is nothing to relax.
 
         Parameters
         ----------
         x : ndarray
             Scaled gains that the search has reached.
         kept : collection of int
-            Numbers of loops that have been relaxed before.
+            Numbers of loops that were relaxed before.
         least : float
-            Decay that they keep beside others that reach no more than now; where it is more than `RELAXED` [-].
+            Decay that the relaxed loops keep if the others get no faster than now. It has an effect only if it asks
+            more of them than `RELAXED` [-].
         """
         each = self._each(x)
         worst = max(each)
@@ -130,12 +135,12 @@ class Search:
         ], near
 
     def sooner(self, x, after, keep, budget, enough, progress=None):
-        """Scaled gains near x with which motions leave less, and no pole of any loop is slower than `keep`.
+        """Scaled gains near x with which motions leave less behind, and the decay of no loop is below `keep`.
 
         Parameters
         ----------
         x : ndarray
-            Scaled gains that hold.
+            Scaled gains with which all loops are stable.
         after : AfterMotion
         keep : float
             Least decay [-].
@@ -144,12 +149,12 @@ class Search:
         enough : float
             Value of `after` at which the search ends.
         progress : callable, optional
-            Called with a fraction of the work.
+            Called with the fraction of the work that is done.
 
         Returns
         -------
         ndarray
-            x itself, if none are found that keep the decay and leave less than `TAKEN` of what x leaves.
+            x itself, if no gains are found that keep the decay and leave less than `TAKEN` times what x leaves.
         """
         slow, low, done = self._smooth(self.slowest.loops, NARROW), -AIM * keep, 0
 
@@ -158,7 +163,7 @@ class Search:
             done += 1
             if progress is not None and done % REPORTED == 0:
                 progress(min(done / budget, 1.0))
-            pole, by_pole = slow(x)  # and the penalties
+            pole, by_pole = slow(x)  # penalties included
             value, slope = after(x) if np.isfinite(pole) else (np.inf, 0.0 * x)
             if not np.isfinite(value):
                 return np.inf, np.zeros_like(x)
@@ -173,7 +178,7 @@ class Search:
         return found if less and self.value(found) < -0.99 * keep else x
 
     def _each(self, x):
-        """The slowest pole of each loop that gains move, as a value."""
+        """For each loop, the value v of the slowest pole that gains move."""
         self.evaluations += 1
         return [one.v for one in self.slowest.each(x)]
 
@@ -187,7 +192,7 @@ class Search:
         return value, gradient + 2.0 * SMALL_GAINS * x + 20.0 * below
 
     def _smooth(self, loops, width):
-        """What is minimised, of some loops."""
+        """The function that a descent minimises, for some loops."""
         part = self.slowest.smooth(loops, width)
 
         def function(x):
@@ -199,7 +204,7 @@ class Search:
 
 
 def _worst(each, chosen):
-    """Numbers of the two worst loops of `each` value that are worse than all that are `chosen`."""
+    """Numbers of the worst loops, at most two, that are worse than all `chosen` ones; `each` has the loops' values."""
     most = max((each[k] for k in chosen), default=-np.inf)
     worse = [k for k, value in enumerate(each) if value > most and k not in chosen]
     return sorted(worse, key=lambda k: -each[k])[:2]
@@ -208,17 +213,17 @@ def _worst(each, chosen):
 def race(searches, effort=1.0, progress=None):
     """The best of several searches, each with its starts.
 
-    After a short run of each start the best one of each search goes on, then the best of all: stable gains that are
-    hardly any look better at first than firm ones that are not stable yet.
+    After a short run from each start, the best start of each search goes on, then the best of all. The short runs alone
+    do not decide: at first, very small stable gains look better than firm ones that are not yet stable.
 
     Parameters
     ----------
     searches : sequence of (Search, sequence of ndarray)
         Each with the scaled gains to start from.
     effort : float
-        Of the search; 1.0 is the usual one.
+        Factor of the evaluations; 1.0 is the usual number.
     progress : callable, optional
-        Called with a fraction of the work and the decay that is reached.
+        Called with the fraction of the work that is done and the decay that is reached.
 
     Returns
     -------
@@ -254,16 +259,17 @@ def race(searches, effort=1.0, progress=None):
 
 
 def follow(search, starts, effort=1.0):
-    """Scaled gains of a search that goes on from the better one of its `starts`, after a short run of each."""
+    """Scaled gains of a search that makes a short run from each of the `starts`, and goes on from the best result."""
     found = [search.refined(x, effort * FIRST, WIDTHS[:2]) for x in starts]
     value, x = min(found, key=lambda one: one[0])
     return x if value < -search.enough else search.refined(x, effort * MIDDLE)[1]
 
 
 def nearby(search, x, count, enough, seed=0, progress=None):
-    """The best (value, scaled gains) of searches from x, then `count` - 1 times from random gains near the best so far.
+    """The best (value, scaled gains) of a search from x, then of `count` - 1 from random gains near the best so far.
 
-    The slowest pole of many loops has kinks, in which a search ends far from what gains a tenth away lead to.
+    The slowest pole of many loops has kinks. A search may end in one, while gains a tenth away lead to much better
+    results.
 
     Parameters
     ----------
@@ -271,10 +277,10 @@ def nearby(search, x, count, enough, seed=0, progress=None):
     x : ndarray
     count : int
     enough : float
-        Decay at which no further search begins [-].
+        No further search begins at this decay [-].
     seed : int
     progress : callable, optional
-        Called with a fraction of the work and the decay that is reached.
+        Called with the fraction of the work that is done and the decay that is reached.
     """
     random, best, waited = np.random.default_rng(seed), (search.value(x), x), 0
     for k in range(count):
@@ -290,14 +296,14 @@ def nearby(search, x, count, enough, seed=0, progress=None):
 
 
 def start(model, at, scale, a, late, corner=np.inf):
-    r"""Gains of joints alone with a natural frequency of a omega_1, as far as a torque that is `late` [s] allows.
+    r"""Start gains of the joints alone, with the natural frequency a omega_1 as far as the delay `late` [s] allows.
 
-    What a torque moves at first is not the arm but the inertia that is left when the links bend, 1 / H_ii with
+    At first a torque does not move the whole arm, but only the inertia 1 / H_ii that remains when the links bend, with
 
     .. math:: H_{ii} = \sum_{\omega_k\le\omega_c}\phi_{ik}^2
 
-    over the modes :math:`\phi_k`, of mass 1, that a low pass of the `corner` lets pass; without one H is the inverse of
-    the mass matrix. K_qd H_ii late is kept below a third.
+    over the modes :math:`\phi_k`, normalised to mass 1, that a low pass with the `corner` :math:`\omega_c` lets pass;
+    without a low pass H is the inverse of the mass matrix. K_qd H_ii late is limited to a third.
 
     Parameters
     ----------
@@ -307,9 +313,9 @@ def start(model, at, scale, a, late, corner=np.inf):
     scale : ndarray, shape (n, 3n + 2m)
         Unit of each gain.
     a : float
-        [-]
+        Natural frequency over omega_1 [-].
     late : float
-        [s]
+        Delay of the torque [s].
     corner : float
         Of the torque's low pass [rad/s]; infinite: none.
 
@@ -329,7 +335,7 @@ def start(model, at, scale, a, late, corner=np.inf):
 
 
 def _mobility(model, q, corner):
-    """Joint acceleration per torque, as far as the modes up to a `corner` [rad/s] make it, (n,) [1/(kg m^2)]."""
+    """Acceleration of each joint per its torque, by the modes up to a `corner` [rad/s] only, (n,) [1/(kg m^2)]."""
     n, terms = model.n_joints, model.terms(q, np.zeros(model.n_joints))
     stiffness = np.zeros_like(terms.M)
     stiffness[n:, n:] = terms.K2

@@ -1,30 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""How soon the tip settles after a motion, for arms that are not what the file says; and the gradient by the gains.
+r"""How soon the tip settles after a motion, for arms that differ from the file; and the gradient by the gains.
 
-The feed-forward moves the arm of the file, :math:`M\ddot z + Kz = Bu` with :math:`z = (q, \delta)`. To an arm with the
+The feed-forward moves the arm of the file, :math:`M\ddot z + Kz = Bu` with :math:`z = (q, \delta)`. For an arm with the
 matrices :math:`M', K'` the same torque leaves the forces
 
 .. math:: f = (M - M')\,\ddot z + (K_{\cdot2} - K'_{\cdot2})\,\delta
 
-to the feedback. They are zero from the end of the motion on, and what they have excited decays. Along a quintic motion
-of a joint by `ANGLE` in `MOTION` locked periods, the bending is taken as quasi-static,
-:math:`\delta = -K_{22}^{-1}M_{21}\ddot q`. The change of the weight along the motion is left out, as is the difference
-in damping. The sampled loop (`loop`) with gains K, linear in one configuration, goes on from sample to sample by
-:math:`X_{k+1} = AX_k + Sf_k`. It moves the tip by :math:`y_k = CX_k`, in units of the distance within which it is
-settled. What is made small is about the time until it is, in locked periods T from the motion's end on, with a motion j
-of each joint:
+to the feedback. They are zero after the end of the motion, and the vibration that they have excited decays. The motion
+is a quintic of one joint by `ANGLE` in `MOTION` locked periods. Its bending is taken as quasi-static,
+:math:`\delta = -K_{22}^{-1}M_{21}\ddot q`. The change of the weight along the motion and the difference in damping are
+left out. The sampled loop (`loop`) with gains K, linear about one configuration, moves from sample to sample by
+:math:`X_{k+1} = AX_k + Sf_k`. The tip moves by :math:`y_k = CX_k`, in units of the distance within which it counts as
+settled. The search minimises a number J. It is about the time from the end of the motion until the tip has settled, in
+locked periods T, with one motion j of each joint:
 
 .. math:: J^3 = \frac{3}{T^3}\int_0^{6T} t^2\,\ln\Bigl(1 + \sum_j|y_j(t)|^2\Bigr)\,dt .
 
-Where the logarithm is one until :math:`t = sT`, and then zero, J = s. The gradient by the gains follows from
-the adjoint recursion
+If the logarithm is one until :math:`t = sT` and then zero, J = s. The gradient by the gains follows from the adjoint
+recursion
 
 .. math:: \Lambda_k = A^T\Lambda_{k+1} + C^T\frac{\partial J}{\partial y_k}, \qquad
     \frac{\partial J}{\partial A} = \sum_k\Lambda_{k+1}X_k^T, \qquad
     \frac{\partial J}{\partial S} = \sum_k\Lambda_{k+1}f_k^T .
 
-Where a locked period has many samples, several are one step: A and S of two steps are :math:`A^2` and :math:`S + AS`.
-After the motion steps are longer still.
+If a locked period has many samples, several samples are taken as one step: A and S of two steps are :math:`A^2` and
+:math:`S + AS`. After the motion the steps are longer still.
 """
 
 import numpy as np
@@ -40,26 +40,26 @@ from .loop import sampled_loop
 from .tip import Tip
 from .uncertain import richer
 
-#: A motion turns each joint by this [rad], in so many locked periods; then the tip is looked at for so many.
+#: A motion turns one joint by this angle [rad], in this many locked periods. Then the tip is watched for this many.
 ANGLE, MOTION, WATCHED = np.radians(75.0), 2.0, 6.0
 #: The tip has settled within this fraction of the reach [-].
 TOLERANCE = 1e-3
-#: Samples are taken together as long as a locked period has at least so many steps. Where it has, two to the power of
-#: this many steps are one after the motion.
+#: Samples are combined into longer steps as long as a locked period still has at least `STEPS` steps. If it has, a step
+#: after the motion combines two to the power of `LONGER` steps.
 STEPS, LONGER = 32, 1
-#: Power of the time by which what is left is weighted: what comes last counts most.
+#: The tip's distance is weighted by this power of the time: the latest part counts most.
 LATE = 2
-#: An arm with Coulomb friction is also looked at with these parts of the damper that its friction is at rest. What is
-#: left then counts less: the motion is larger than those that meet so much of it.
+#: An arm with Coulomb friction is also tested with friction as a damper, at these fractions of the damper at rest. Its
+#: J is then multiplied by `RUBS`: friction damps so strongly only in movements smaller than this motion.
 RUBBING, RUBS = (0.1, 0.3), 0.7
-#: Poles that turn faster than the first and slower than the second of these times the lowest locked frequency ring.
+#: A pole rings if its imaginary part is between these multiples of the lowest locked frequency.
 RING = 0.5, 6.0
-#: Of the sum over all arms and configurations: the worst counts most.
+#: Power of J in the sum over all arms and configurations: the worst counts most.
 POWER = 8.0
 
 
 class Residual:
-    """What a motion that ends in one configuration leaves at the tip of one arm, under gains K.
+    """Movement of one arm's tip after a motion that ends in one configuration, under gains K.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Residual:
     forces : ndarray, shape (k, h, n)
         Forces on joints and modes in each step of the motion of each joint [N m], [N].
     push : ndarray, shape (s, h)
-        What a force does to the plant's state in one sample.
+        Change of the plant's state in one sample by a unit of each force.
     tip : ndarray, shape (3, h)
         Jacobian of the tip by joints and deflections, over the tolerance.
     period : float
@@ -101,7 +101,7 @@ class Residual:
         self._weight = (LATE + 1.0) * step * self._time**LATE
 
     def _moved(self, K):
-        """A and S of each doubling, and the states X of all steps as rows, (steps + 1, n, N)."""
+        """A and S after each doubling of the step, and the states X of all steps as rows, (steps + 1, n, N)."""
         A, S = self.loop.F - self.loop.G @ (K @ self.loop.N), self._S
         doubled = [(A, S)]
         for _ in range(self._doublings + self._longer):
@@ -116,25 +116,25 @@ class Residual:
         return doubled, X
 
     def distance(self, K):
-        """Distance of the tip from its place over the tolerance, in steps from the end of the motion on."""
+        """Distance of the tip from its goal over the tolerance, in each step from the end of the motion on."""
         X = self._moved(K)[1][len(self._forces) :]
         return np.sqrt(((X @ self._C.T) ** 2).sum(axis=(1, 2)))
 
     def settling(self, K):
-        """Time from the end of the motion until the tip has settled, in locked periods; infinite: not while watched."""
+        """Locked periods from the end of the motion until the tip has settled; infinite: not within `WATCHED`."""
         outside = np.flatnonzero(~(self.distance(K) <= 1.0))
         if not outside.size:
             return 0.0
         return np.inf if outside[-1] == self._after else float(self._time[outside[-1] + 1])
 
     def ringing(self, K):
-        """Decay of the slowest pole that rings, over the lowest locked frequency; infinite: none does [-]."""
+        """Decay of the slowest pole that rings (`RING`), over the lowest locked frequency; infinite: none rings [-]."""
         s = np.log(eigenvalues(self.loop, K)[1].astype(complex)) / self.loop.period / self._omega
         low, high = RING
         return -s.real[(s.imag > low) & (s.imag < high)].max(initial=-np.inf)
 
     def __call__(self, K):
-        """J, and its gradient by K; infinite where the tip leaves the range of numbers."""
+        """J, and its gradient by K; J is infinite if the tip's movement overflows."""
         with np.errstate(over="ignore", invalid="ignore"):
             doubled, X = self._moved(K)
             first = len(self._forces)
@@ -163,7 +163,7 @@ class Residual:
 
 
 def _outer(left, right):
-    """Sum of the products of all rows of some matrices with those of others."""
+    """Sum of the outer products of corresponding rows of two stacks of matrices."""
     return left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2])
 
 
@@ -175,7 +175,7 @@ class AfterMotion:
     slowest : SlowestScheduled
         Scales the gains.
     residuals : sequence of (int, Residual)
-        Each with the number of its set of gains.
+        Each after the number of its set of gains.
     """
 
     def __init__(self, slowest, residuals):
@@ -198,7 +198,7 @@ class AfterMotion:
         return float(value), np.concatenate([(one * scale)[free] for one in slope])
 
     def ringing(self, x):
-        """Least `Residual.ringing` of the arms whose joints rub; infinite: there are none [-]."""
+        """Least `Residual.ringing` of the arms whose joints friction damps; infinite: there are none [-]."""
         K = self._slowest.gains(x)
         return min((one.ringing(K[k]) for k, one in self._residuals if one.rubs), default=np.inf)
 
@@ -209,7 +209,7 @@ class AfterMotion:
 
 
 def residuals(nominal, q, sampling, uncertainty):
-    """The `Residual` of each arm of which payload or stiffness alone differs, in configuration q (n,) [rad]."""
+    """A `Residual` for each arm of which only payload or only stiffness differs, in configuration q (n,) [rad]."""
     arm = richer(nominal.arm.whole)
     period = 2.0 * np.pi / nominal.frequencies(q, locked=True)[0]
     doublings = max(0, int(np.log2(max(period / STEPS / sampling.period, 1.0))))
@@ -221,7 +221,7 @@ def residuals(nominal, q, sampling, uncertainty):
         plant = build(scaled(arm, payload, stiffness))
         try:
             forces, push = motion.leaves(plant, sampling.period)
-        except ModelError:  # heavier than what rests there
+        except ModelError:  # too heavy to rest there
             continue
         tip = Tip(plant, q).J / (TOLERANCE * arm.reach)
         for part in parts:
@@ -232,7 +232,7 @@ def residuals(nominal, q, sampling, uncertainty):
 
 
 class Motion:
-    """The motion of each joint of the file's arm that ends in one configuration, and the forces that it takes.
+    """For each joint a motion of the file's arm that ends in one configuration, and the forces that it takes.
 
     Parameters
     ----------
@@ -263,20 +263,20 @@ class Motion:
         self.torque = self._forces(self._M, self._K)[:, :n].transpose(0, 2, 1)
 
     def _forces(self, M, K):
-        """Forces (k, h, n) of an arm with these matrices in each step of the motion of each joint."""
+        """Forces (k, h, n) that move an arm with these matrices, in each step of the motion of each joint."""
         by_acceleration = M @ self._moved + K @ self._bending
         forces = np.multiply.outer(self._acceleration, by_acceleration)
         return forces + np.multiply.outer(self._snap, M @ self._bending)
 
     def leaves(self, plant, period):
-        """Forces (k, h, n) that its torque leaves to the feedback of a `plant`, and what they do in a sample.
+        """Forces (k, h, n) that the motion's torque leaves to the feedback of a `plant`, and their effect in a sample.
 
-        The latter, (2h, h), is the change of the plant's state by one of each force for a `period` [s].
+        The effect, (2h, h), is the change of the plant's state by a unit of each force for a `period` [s].
 
         Raises
         ------
         ModelError
-            Where the plant does not rest there.
+            If the plant does not rest there.
         """
         M, K, A = _matrices(plant, self._q)
         push = np.vstack([np.zeros_like(M), np.linalg.inv(M)])

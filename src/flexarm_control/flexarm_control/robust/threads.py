@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls compiled functions of many rows with a part of the rows on each processor.
+"""Calls compiled functions on many rows, with a part of the rows on each processor.
 
-While a compiled function runs, it does not hold the interpreter's lock.
+A compiled function does not hold the interpreter's lock while it runs.
 """
 
 import os
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 
-#: Less work than this stays on one processor: N^3 of all rows.
+#: Work up to this stays on one processor. The measure of work is the sum of N^3 over all rows.
 SMALL = 3e4
 
 
 def count():
-    """How many threads: one for each processor that this process may use, at most as many as ``OMP_NUM_THREADS`` says.
+    """Number of threads: one for each processor that this process may use, but at most ``OMP_NUM_THREADS``.
 
-    As for the libraries of linear algebra. It is 1 in nodes and in ``make test``, where several processes share the
-    machine.
+    The libraries of linear algebra follow the same rule. The number is 1 in nodes and in ``make test``, where several
+    processes share the machine.
     """
     free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     given = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
@@ -28,7 +28,7 @@ def _pool(threads):
     return ThreadPoolExecutor(threads, "design")
 
 
-if hasattr(os, "register_at_fork"):  # a child has no threads but one
+if hasattr(os, "register_at_fork"):  # a forked child has only one thread
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
@@ -38,8 +38,8 @@ def in_parts(calls):
     Parameters
     ----------
     calls : sequence of tuple
-        A function; its arrays, with equally many rows, of which each is computed from its own row of the arrays alone;
-        and the states N of each row: it takes a time of about N^3.
+        A function, its arrays, and the number N of states of each row. The arrays have equally many rows. A row's
+        results depend only on the same row of the arrays, and take a time of about N^3.
     """
     total = sum(len(arrays[0]) * size**3 for _, arrays, size in calls)
     parts = [[] for _ in range(count() if total > SMALL else 1)]

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""What the gains of a design mean at the tip: how stiff it is against a static force, and how soon it settles.
+r"""Effect of a design's gains at the tip: how stiff it is against a static force, and how soon it settles.
 
-At rest a small force f at the tip, with its Jacobian :math:`J = [J_q\;J_\delta]`, moves the arm by x, where
+At rest a small force f at the tip moves the arm by x, where :math:`J = [J_q\;J_\delta]` is the tip's Jacobian and
 
-.. math:: K x = J^T f + \begin{bmatrix}I\\0\end{bmatrix} u, \qquad u = -K_c x,
+.. math:: K x = J^T f + \begin{bmatrix}I\\0\end{bmatrix} u, \qquad u = -K_c x .
 
-K being the stiffness of links and weight and :math:`K_c` the gains of joint angles and deflections. The integral adds
-torque until :math:`q` is back in its place: then the links alone bend. The tip's displacement is :math:`C f` with the
-compliance :math:`C = J\,\partial x/\partial f`; its stiffness is that in the softest direction.
+K is the stiffness due to links and weight, and :math:`K_c` are the gains of joint angles and deflections. The integral
+adds torque until :math:`q` is back in its place. Then only the links bend. The tip's displacement is :math:`C f` with
+the compliance :math:`C = J\,\partial x/\partial f`. Its stiffness is the one in the softest direction.
 """
 
 import numpy as np
@@ -16,12 +16,12 @@ from flexarm_dynamics.linear import jacobian, linear_plant, sampled, state_at_re
 
 #: A tip has settled within this fraction of its largest displacement [-].
 SETTLED = 0.02
-#: A loop is simulated for so many time constants of its slowest pole, in so many steps at most.
+#: A loop is simulated for this many time constants of its slowest pole, in at most about this many steps.
 HORIZON, MAX_STEPS = 10.0, 20_000
 
 
 class Tip:
-    """The tip of an arm at rest, linear.
+    """The tip of an arm, linearised at rest.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Tip:
     J : ndarray, shape (3, n + m)
         Its Jacobian by joint angles and deflections.
     force : ndarray, shape (2 (n + m), 3)
-        What a force does to the derivative of the state (q, delta, qd, delta_d).
+        Derivative of the state (q, delta, qd, delta_d) by a unit force at the tip.
     """
 
     def __init__(self, model, q):
@@ -47,22 +47,22 @@ class Tip:
         self.force = np.vstack([np.zeros((half, 3)), np.linalg.solve(terms.M, self.J.T)])
 
     def compliance(self, K=None):
-        """C of the tip, (3, 3) [m/N]: joints held in their place, or by the gains K (n, n + m) [N m/rad, N]."""
+        """C of the tip, (3, 3) [m/N], with the gains K (n, n + m) [N m/rad, N]; without K the joints are locked."""
         n, half = self._n, self.J.shape[1]
         A, B, pushed = self._A[half:, :half], self._B[half:], self.force[half:]
         if K is not None:
             return -self.J @ np.linalg.solve(A - B @ K, pushed)
-        # Unknown are the torques that hold the joints, and the deflections.
+        # The unknowns are the torques that hold the joints, and the deflections.
         found = -np.linalg.solve(np.hstack([B, A[:, n:]]), pushed)
         return self.J[:, n:] @ found[n:]
 
     def settling(self, loop, K, direction):
-        """Time after which a tip that a constant force has moved, and that is let go, has `SETTLED` left [s].
+        """Settling time of the tip after a constant force is removed, until `SETTLED` of the displacement is left [s].
 
         Parameters
         ----------
         loop : Loop
-            Of the same arm in the same configuration, stable with the gains K.
+            Of the same arm in the same configuration; it must be stable with the gains K.
         K : ndarray, shape (n, 3n + 2m)
         direction : ndarray, shape (3,)
             Of the force.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Designs of several speeds for one arm: what a faster loop costs in robustness and noise."""
+"""Designs with several speeds for one arm: they show what a faster loop costs in robustness and noise."""
 
 from dataclasses import replace
 
@@ -8,10 +8,10 @@ from .uncertain import Uncertainty
 
 
 def trade(arm, speeds, settings=None, uncertainty=None, progress=None):
-    """A `Design` for each of the `speeds`, from the slowest on; each search also starts from the gains of the last one.
+    """A `Design` for each of the `speeds`, the slowest first; each search also starts from the gains of the last one.
 
-    A faster design asks for more decay and allows more noise, so that the gains of a slower one are never worse than a
-    start of its own. None is replaced by a slower one for its torque limits.
+    A faster design asks for more decay and allows more noise. So the gains of a slower design are never a worse start
+    than its own starts. No design is replaced by a slower one because of the torque limits.
 
     Parameters
     ----------
@@ -19,10 +19,10 @@ def trade(arm, speeds, settings=None, uncertainty=None, progress=None):
     speeds : sequence of float
         See `Settings.speed`.
     settings : Settings, optional
-        Of all of them.
+        Of all designs; their speed is replaced.
     uncertainty : Uncertainty, optional
     progress : callable, optional
-        As for `design`, with the fraction of all the work.
+        As for `design`, with the fraction of the work for all designs.
 
     Returns
     -------

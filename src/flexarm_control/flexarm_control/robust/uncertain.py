@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The set of loops that a design is for: what may differ from the arm file, and where the arm is."""
+"""The set of loops for a design: what may differ from the arm file, and in which configurations the arm is."""
 
 from dataclasses import dataclass, replace
 
@@ -11,31 +11,32 @@ from flexarm_dynamics.models.model import build
 
 from .loop import ARM, MARGIN, sampled_loop
 
-#: Configurations are drawn within this of straight [rad].
+#: Joint angles of the drawn configurations are at most this far from straight [rad].
 WORKSPACE = 1.3
-#: Fraction of the decay that is asked of loops for a margin: another gain or delay, the file's modes alone.
+#: Fraction of the decay that is asked of loops for a margin: another gain or delay, or the file's modes only.
 UNLIKELY = 0.5
-#: Of an arm that sticks: parts of the damper that its Coulomb friction is at rest, as movements of several sizes meet
-#: it, and the fraction that is asked of each. At rest it creeps: friction over stiffness is its time.
+#: For an arm that sticks: Coulomb friction as a damper for movements of several sizes, over the damper that it is at
+#: rest, and the fraction of the decay that is asked in each case. At rest the arm creeps, with the time constant
+#: friction over stiffness.
 STICKING = {1.0: 0.1, 0.1: 0.3}
-#: Damping ratio that every mode is taken to have at least [-].
+#: Every mode is assumed to have at least this damping ratio [-].
 MIN_DAMPING = 1e-4
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the design holds for.
+    """The uncertainty for which the design must be stable.
 
     Attributes
     ----------
     payload, stiffness, damping : (float, float)
-        Least and greatest factor of what the file says [-].
+        Least and greatest factor of the value in the file [-].
     gain : (float, float)
-        Of the torque on its way to the arm [-].
+        Least and greatest factor of the torque on its way to the arm [-].
     delay : float
-        So much later than the stated delay a torque may come, in periods [-].
+        Additional delay of the torque beyond the stated one, in periods [-].
     edges : bool
-        Whether it is also looked at arms of which payload or stiffness alone differs.
+        Whether the loops include arms of which only payload or only stiffness differs.
     """
 
     payload: tuple = (0.7, 1.3)
@@ -47,7 +48,10 @@ class Uncertainty:
 
 
 def configurations(arm, seed=0):
-    """Configurations to design for, (k, n) [rad]: straight, and drawn evenly from the position limits."""
+    """Configurations of a design, (k, n) [rad]: one that is nearly straight, others spread evenly over the limits.
+
+    One joint: straight, and with gravity two more near its position limits.
+    """
     n = len(arm.joints)
     low, high = np.clip(arm.position_limits, -WORKSPACE, WORKSPACE).T
     middle = np.clip(0.0, low, high)
@@ -62,13 +66,12 @@ def configurations(arm, seed=0):
     drawn = qmc.scale(
         qmc.Halton(n, seed=seed).random(4 if n == 2 else 5), low, np.maximum(high, low + 1e-9)
     )
-    if n > 1:
-        drawn[0] = 0.9 * middle + 0.1 * high
+    drawn[0] = 0.9 * middle + 0.1 * high
     return drawn
 
 
 def resting(model, at):
-    """Those of the configurations in which the arm rests under gravity."""
+    """The configurations in which the arm rests under gravity."""
     kept, why = [], None
     for q in np.atleast_2d(np.asarray(at, float)):
         try:
@@ -95,7 +98,7 @@ def rests(model, q):
 
 
 def richer(arm):
-    """The arm with one mode more in each direction of each link; itself where shapes are measured or given."""
+    """The arm with one mode more in each direction of each link; none is added where shapes are measured or given."""
     if arm.model != "chain":
         return arm
     links = tuple(
@@ -112,16 +115,20 @@ def richer(arm):
 
 
 def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
-    """The set of loops that a design is for.
+    """The set of loops for a design.
 
-    In each configuration the softest, the stated and the stiffest arm, each one mode richer than the file, with the
-    delay and without; then the same of the arm with the file's modes alone: a mode beyond the file's lets a joint give
-    way, and gains may hold with it that do not hold without it. In the first configuration a loop with more and one
-    with less gain, and one that is later. An arm with Coulomb friction also sticks, each of the three: its friction is
-    a damper, as steep at rest as its smoothing makes it, and less for larger movements, by the first harmonic. What is
-    stable with every part of it does not hunt. Joint speeds are filtered derivatives in all of them, as the observer's
-    are (`observer.measured_velocity`): a loop with measured speeds is another one. With ``uncertainty.edges`` also arms
-    of which payload or stiffness alone differs, with the delay.
+    - In each configuration: the softest, the stated and the stiffest arm, each with one mode more than the file, with
+      the delay and without.
+    - In each configuration: the stated arm with the file's modes only, with the delay and without. A mode beyond the
+      file's makes a joint more compliant, so gains may be stable with it and unstable without it.
+    - In the first configuration: the stated arm with a larger gain, with a smaller gain, and with a longer delay.
+    - If the arm has Coulomb friction: each of the three arms, sticking. Friction is then a damper. At rest it is as
+      steep as its smoothing makes it; for larger movements it is less, by the first harmonic. A loop that is stable
+      with every fraction of this damper does not hunt.
+    - With ``uncertainty.edges``: arms of which only payload or only stiffness differs, with the delay.
+
+    In all loops joint speeds are filtered derivatives, like the observer's (`observer.measured_velocity`). A loop with
+    measured speeds differs from these.
 
     Parameters
     ----------
@@ -134,7 +141,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
     first : int
         Number of the first configuration, for names.
     sticking : bool
-        Whether an arm with Coulomb friction also sticks.
+        Whether loops that stick are included, for an arm with Coulomb friction.
 
     Returns
     -------
@@ -165,7 +172,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
                     one = sampled_loop(
                         nominal, plant, q, samples, 1.0, name_here, fraction, kind=kind
                     )
-                except ModelError:  # heavier than what rests there
+                except ModelError:  # too heavy to rest there
                     continue
                 out.append(one)
     later = replace(sampling, delay=sampling.delay + uncertainty.delay * sampling.period)
@@ -185,7 +192,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
 
 
 def _sticking(nominal, plants, at, sampling, first):
-    """Loops of `plants`, by their names, with the damper that Coulomb friction is for small movements."""
+    """Loops of the named `plants` that stick: for small movements their Coulomb friction is a damper."""
     out = []
     for i, q in enumerate(at, first):
         for name, plant in plants.items():
@@ -199,10 +206,11 @@ def _sticking(nominal, plants, at, sampling, first):
 
 
 def reach(model, at, late):
-    """Frequency up to which a torque that is `late` [s] can do something about a mode, omega_c [rad/s].
+    """Frequency up to which a torque that is `late` [s] can influence a mode, omega_c [rad/s].
 
-    The delay turns a torque by omega times it: by one radian at most. Above one and a half times the controller's own
-    stiffest mode it knows none.
+    At the frequency omega the delay is a phase lag of omega times `late`, and one radian is the most that is allowed.
+    The frequency is also at most 1.5 times that of the stiffest mode in the controller's model, which has no modes
+    beyond that.
     """
     if not model.n_modes:
         return 1.0 / late
@@ -210,6 +218,6 @@ def reach(model, at, late):
 
 
 def own_damping(arm, uncertainty):
-    """Least damping ratio of the arm's modes, as far as it is uncertain [-]."""
+    """Least damping ratio that the arm's modes may have within the `uncertainty` [-]."""
     stated = [d for link in arm.links for f in link.flexible.values() for d in f.damping]
     return max(uncertainty.damping[0] * min(stated, default=0.0), MIN_DAMPING)

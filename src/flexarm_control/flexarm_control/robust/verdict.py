@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a loop in words: stable with margin, fragile and to what, or unstable and in what.
+"""The verdict on a loop in words: stable with margin, fragile and to what, or unstable and in which joint or mode.
 
-Judged are the sampled loops of `whole`, with observer and delay, in one or several configurations at rest. Each of
-`PERTURBATIONS` is tried by itself, the rest as in the arm file. A loop that bears them all is stable with margin.
+The verdict is on the sampled loops of `whole`, with observer and delay, at rest in one or several configurations. Each
+of the `perturbations` is tried alone; the rest is as in the arm file. Loops that stay stable under all of them are
+stable with margin.
 """
 
 from dataclasses import asdict, dataclass
@@ -18,7 +19,7 @@ from .limit_cycle import limit_cycles
 from .uncertain import Uncertainty, richer
 from .whole import WholeLoop
 
-#: Phase by which the torques of all joints may lag [rad], and periods by which they may be later [-].
+#: Phase lag of the torques of all joints [rad], and additional delay in periods [-], that are tried.
 PHASE, PERIODS = np.radians(30.0), 1.0
 WITH_MARGIN, FRAGILE, UNSTABLE, UNKNOWN = (
     "stable with margin",
@@ -26,24 +27,24 @@ WITH_MARGIN, FRAGILE, UNSTABLE, UNKNOWN = (
     "unstable",
     "unknown",
 )
-#: Bisections of a limit for what is printed with three digits, and for a quick look.
+#: Bisections of a limit: for a result with three digits, and for a quick estimate.
 FINE, QUICK = 10, 6
 
 
 @dataclass(frozen=True)
 class Perturbation:
-    """What is tried: its words, and factors of the arm file or of the loop."""
+    """What is tried: a description in words, and changes of the arm file or of the loop."""
 
     words: str
     payload: float = 1.0
     stiffness: float = 1.0
     gain: complex = 1.0
-    later: float = 0.0  # [s]
+    later: float = 0.0  # additional delay [s]
     richer: bool = False  # one bending mode more in each direction
 
 
 def perturbations(period):
-    """The stated set, for a sampling `period` [s]; factors as of a design, see `Uncertainty`."""
+    """The standard perturbations, for a sampling `period` [s]; the factors are those of a design, see `Uncertainty`."""
     usual = Uncertainty()
     out = [Perturbation(f"a payload x {f:g}", payload=f) for f in usual.payload]
     out += [Perturbation(f"a stiffness x {f:g}", stiffness=f) for f in usual.stiffness]
@@ -59,18 +60,18 @@ def perturbations(period):
 
 @dataclass(frozen=True)
 class Bears:
-    """How far a loop may be off until it is unstable, each by itself.
+    """Limits within which a loop is stable; only one quantity varies at a time.
 
     Attributes
     ----------
     payload : (float, float)
-        Least and greatest factor; 0 and None: none was found [-].
+        Least and greatest factor; 0 and None: no limit was found [-].
     delay : float or None
-        Longest, from a measurement to its torque; None: none was found [s].
+        Longest, from a measurement to its torque; None: no limit was found [s].
     reason : str
-        Why it is not known; empty if it is.
+        Why the limits are unknown; empty if they are known.
     limit_cycles : tuple of LimitCycle
-        That play makes likely, though the loop is stable with closed play.
+        Likely because of play, although the loop is stable with closed play.
     """
 
     payload: tuple = (None, None)
@@ -93,9 +94,9 @@ class Verdict:
     word : str
         `WITH_MARGIN`, `FRAGILE`, `UNSTABLE` or `UNKNOWN`.
     text : str
-        A sentence: to what it is fragile, or what is unstable, or why it is unknown.
+        A sentence: to what the loop is fragile, what is unstable, or why the verdict is unknown.
     tried : tuple of (str, bool)
-        Words of each perturbation, and whether the loop bears it.
+        Description of each perturbation, and whether the loop stays stable under it.
     bears : Bears
     """
 
@@ -127,7 +128,7 @@ class Judge:
         self._models = {}
 
     def stable(self, payload=1.0, stiffness=1.0, gain=1.0, later=0.0, richer=False):
-        """Whether all loops are stable with such an arm, gain and delay, as in `Perturbation`."""
+        """Whether all loops are stable with this perturbation of arm, gain and delay, see `Perturbation`."""
         key = payload, stiffness, richer
         try:
             if key not in self._models:
@@ -142,7 +143,7 @@ class Judge:
             return False
 
     def limit_cycles(self):
-        """What `limit_cycle.limit_cycles` finds in the loops: the largest of each joint."""
+        """Limit cycles in the loops by `limit_cycle.limit_cycles`; for each joint the one of the largest amplitude."""
         plant, found = build(self.arm), {}
         for loop in self.loops:
             whole, c = loop.plant(plant), loop.controller
@@ -156,7 +157,7 @@ class Judge:
         return list(found.values())
 
     def bears(self, bisections=FINE):
-        """`Bears` of the loops, in so many `bisections`."""
+        """`Bears` of the loops, each limit found by this number of `bisections`."""
         if not self.stable():
             return Bears(reason="the loop is unstable as it is")
         T = self.period
@@ -187,7 +188,7 @@ class Judge:
 
 
 def unknown(reason):
-    """The `Verdict` on a loop that can't be judged."""
+    """The `Verdict` on a loop that cannot be judged."""
     return Verdict(UNKNOWN, f"{UNKNOWN}: {reason}", (), Bears(reason=str(reason)))
 
 

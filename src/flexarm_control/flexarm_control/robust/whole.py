@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The sampled loop with its observer, its delay and a law of any type: linear about rest, made by differences.
+r"""The sampled loop with its observer, its delay and a law of any type, linearised about rest by finite differences.
 
-Observer and law are asked as they are: their states x, found by which arrays move, and their measurements
-:math:`y = (q, \dot q, \hat\delta, \dot\delta, u_{applied})`, as far as the source sends them, are moved one by one, so
-that
+Observer and law are called as they are. Their states x are the arrays that change. These and the measurements
+:math:`y = (q, \dot q, \hat\delta, \dot\delta, u_{applied})`, as far as the source sends them, are changed one by one.
+The differences give
 
 .. math:: x_{k+1} = A x_k + B y_k, \qquad u_k = C x_k + D y_k
 
-is what their own `step` does, filters, integrals and compensators included. The feed-forward rests. The arm (2), linear
-about rest (`linear_plant`), moves exactly from sample to sample, and torques are under way for the delay, as in `loop`.
+for their own `step`, filters, integrals and compensators included. The feed-forward rests. The arm (2), linear about
+rest (`linear_plant`), is sampled exactly, and a torque acts after the delay, as in `loop`.
 """
 
 import copy
@@ -25,19 +25,22 @@ from ..low_pass import LowPass
 from ..trajectory import ReferenceGenerator
 from .loop import measured_amplitudes
 
-#: Steps of the differences [rad, m, N m, …]: the smaller one where friction bends within the larger; and what is zero.
+#: Steps of the differences [rad, m, N m, …]; the smaller one is used if friction is curved within the larger one. An
+#: entry that is no larger than `NONE` counts as zero.
 STEPS, NONE = (1e-6, 1e-8), 1e-12
-#: Where an answer jumps it is asked this far beside [rad]; a jump is a curvature over this, relative to the slope [-].
+#: If an answer jumps, the differences are taken at this distance instead [rad]. An answer jumps if its second
+#: difference is larger than `JUMP`, relative to the first difference [-].
 BESIDE, JUMP = (0.0, 1e-3, -2e-3), 1e-3
-#: Samples in which an observer has to converge, and to settle to a fraction; looked at each so many samples.
+#: An observer must converge within `CONVERGING` samples. Then at most `SETTLING` samples follow, until no array changes
+#: by more than the fraction `SETTLED` in `EACH` samples.
 CONVERGING, SETTLING, EACH, SETTLED = 20_000, 3000, 50, 1e-9
-#: A pole counts as growing beyond this, absolute [1/s] and by its size [-]: errors of the differences.
+#: A pole counts as growing beyond this value, absolute [1/s] plus relative to its size [-]: differences are inexact.
 ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
 class Source:
-    """What the arm's driver sends: joint speeds, and rates of the deflections."""
+    """Whether the arm's driver sends joint speeds, and rates of the deflections."""
 
     velocity: bool = True
     rate: bool = False
@@ -45,7 +48,7 @@ class Source:
 
 @dataclass(frozen=True)
 class LinearController:
-    """Observer and law about rest in q; see the module."""
+    """Observer and law, linear about rest in q; see the module."""
 
     A: np.ndarray
     B: np.ndarray
@@ -59,11 +62,11 @@ class LinearController:
 
 
 class _JumpError(Exception):
-    """An answer that has no derivative."""
+    """An answer jumps, so it has no derivative."""
 
 
 class _Asked:
-    """An observer and a law that are asked for one sample after another, and put back between them."""
+    """An observer and a law that are called sample by sample, and can be put back to their state at rest."""
 
     def __init__(self, law, observer, q, period, source):
         self.law, self.observer, self.source = law, observer, source
@@ -112,7 +115,7 @@ class _Asked:
             self.ask(self.at_rest)
 
     def ask(self, y):
-        """Whether the estimate has converged, and the torque that answers measurements y."""
+        """Whether the estimate has converged, and the torque for measurements y."""
         n, m, s = self.model.n_joints, self.model.n_modes, self.sample
         sizes = [n, n * self.source.velocity, m, m * self.source.rate]
         position, velocity, amplitude, rate, torque = np.split(y, np.cumsum(sizes))
@@ -138,7 +141,7 @@ class _Asked:
         return True, np.array(u)
 
     def put_back(self):
-        """As it was when the observer had settled."""
+        """Restore the state in which the observer had settled."""
         for part, arrays, attributes in self.kept:
             vars(part).update(attributes)
             for name, values in arrays.items():
@@ -146,18 +149,18 @@ class _Asked:
         self.observer._order, self.count = copy.copy(self.order), self.begun
 
     def _vectors(self):
-        """Vectors that were finite at rest; one that was not is a limit that the arm file leaves open, and no state."""
+        """Vectors that were finite at rest. Others are limits that the arm file leaves open, and not states."""
         for part, arrays, _ in self.kept:
             for name, values in arrays.items():
                 if values.ndim == 1 and np.isfinite(values).all():
                     yield getattr(part, name)
 
     def states(self):
-        """Every vector of observer and law, one after another, (N,)."""
+        """All vectors of observer and law, joined, (N,)."""
         return np.concatenate([np.zeros(0), *self._vectors()])
 
     def move(self, i, by):
-        """Move one entry of `states`."""
+        """Change entry i of `states`."""
         for vector in self._vectors():
             if i < vector.size:
                 vector[i] += by
@@ -173,7 +176,7 @@ def _same(values, others):
 
 
 def _arrays(part):
-    """Copies of the arrays of numbers that an object has itself."""
+    """Copies of an object's own writeable arrays of floats."""
     return {
         name: value.copy()
         for name, value in vars(part).items()
@@ -182,7 +185,7 @@ def _arrays(part):
 
 
 def linear_controller(law, observer, q, period, source=None):
-    """A `law` and an `ArmObserver` about rest; both are used for it, and are to be reset afterwards.
+    """A `law` and an `ArmObserver`, linear about rest. This changes the states of both: reset them afterwards.
 
     Parameters
     ----------
@@ -193,7 +196,7 @@ def linear_controller(law, observer, q, period, source=None):
     period : float
         [s]
     source : Source, optional
-        With joint speeds and without rates if not given.
+        If not given, with joint speeds and without rates.
 
     Returns
     -------
@@ -202,9 +205,9 @@ def linear_controller(law, observer, q, period, source=None):
     Raises
     ------
     DesignError
-        Where the observer does not converge, or the law leaves the joints free.
+        If the observer does not converge, the law leaves the joints free, or an answer jumps everywhere.
     FlexarmError
-        Where the arm does not rest there, or a sample is refused.
+        If the arm does not rest there, or a sample is refused.
     """
     if law.free:
         raise DesignError("leaves the joints free: there is no loop", field="the slow law")
@@ -221,7 +224,7 @@ def linear_controller(law, observer, q, period, source=None):
 
 
 def _differenced(asked, step):
-    """As `linear_controller`; None where an answer jumps at q: some observers keep a model per tenth of a radian."""
+    """As `linear_controller`; None if an answer jumps at q: some observers keep one model per tenth of a radian."""
     size, inputs = asked.states().size, asked.at_rest.size
 
     def answered(state, y):
@@ -255,7 +258,7 @@ def _differenced(asked, step):
     C = np.array([c[1] for c in columns]).T.reshape(-1, size)
     B = np.array([r[0] for r in rows]).T.reshape(size, inputs)
     D = np.array([r[1] for r in rows]).T
-    # What nothing depends on is output; what nothing moves, but itself, stays where it is.
+    # Keep only states that something depends on and that something else changes: others are outputs or constants.
     kept = np.arange(size)
     while True:
         felt = (np.abs(A[np.ix_(kept, kept)]) > NONE).any(0) | (np.abs(C[:, kept]) > NONE).any(0)
@@ -271,7 +274,7 @@ def _differenced(asked, step):
 
 
 class WholeLoop:
-    """Closed loops of a `LinearController` with arms that differ from its model.
+    """Closed loops of a `LinearController` with its own model or with arms that differ from it.
 
     Parameters
     ----------
@@ -284,9 +287,9 @@ class WholeLoop:
         self.controller, self.delay, self._plants = controller, delay, {}
 
     def plant(self, model, key=None):
-        """A, B of an arm at rest, with the maps from its deflections to the amplitudes and to the encoders' readings.
+        """A and B of an arm at rest, the map from deflections to amplitudes, and that from (q, delta) to the encoders.
 
-        Kept under a `key`.
+        The result is kept under the `key`.
         """
         if key is None or key not in self._plants:
             c = self.controller
@@ -301,14 +304,14 @@ class WholeLoop:
         return self._plants[key]
 
     def matrix(self, plant=None, gain=1.0, delay=None):
-        """Transition matrix of (s, x, torques under way, newest first); a complex `gain` is a phase.
+        """Transition matrix of (s, x, torques under way, newest first); a complex `gain` turns the phase.
 
         Parameters
         ----------
         plant : tuple, optional
-            As `plant` returns it; the model itself if not given.
+            As `plant` returns it; the controller's model if not given.
         gain : complex
-            Of the torque on its way to the arm [-].
+            Factor of the torque on its way to the arm [-].
         delay : float, optional
             [s]; that of the loop if not given.
         """
@@ -357,7 +360,7 @@ class WholeLoop:
         return F if np.iscomplexobj(gain) else F.real
 
     def poles(self, **off):
-        """Poles of `matrix` as those of continuous time [1/s], slowest first."""
+        """Poles of `matrix`, converted to continuous time [1/s], slowest first."""
         z = np.linalg.eigvals(self.matrix(**off)).astype(complex)
         s = np.log(z[np.abs(z) > 1e-9]) / self.controller.period
         return s[np.argsort(-s.real)]
@@ -371,7 +374,7 @@ class WholeLoop:
         return bool((s.real < ROUNDING * (1.0 + np.abs(s))).all())
 
     def growing(self):
-        """Of the fastest growing pole: s [1/s], and the joint or mode that moves most."""
+        """The fastest growing pole s [1/s], and the joint or mode that moves most in it."""
         F, c = self.matrix(), self.controller
         z, vectors = np.linalg.eig(F)
         s = np.log(z.astype(complex) + 1e-300) / c.period

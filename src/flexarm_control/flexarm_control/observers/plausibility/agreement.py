@@ -8,17 +8,17 @@ Over a window that began at sample 0, with the trapezoidal rule,
     |x - x_0 - D| \le s\max(|x - x_0|, |D|) + \tau|v - v_0| + 6\sqrt2\,\sigma + c + 2J|v|
     + \sum_k\left(\tfrac12|v_k - v_{k-1}|\,h_k + \tfrac14 G|\Delta u_k|\,h_k^2\right) + 6\sigma_v\sqrt{t\,h}
 
-with :math:`\sigma`, c, J and :math:`G|\Delta u|` as in `jumps`; :math:`\tau` is how late a filtered rate may be.
+with :math:`\sigma`, c, J and :math:`G|\Delta u|` as in `jumps`; :math:`\tau` is the largest delay of a filtered rate.
 The sum is what the rule can miss. This includes a step of the torque that moves a light joint and its links to and fro
 between two samples: if a mode is as fast as the sampling, such a swing begins and ends in the same phase. Windows of
-`WINDOWS` samples run at the same time. `PERSISTENT` samples in a row beyond the bound are evidence that a sign is
-wrong, a scale is wrong by more than s, one of the two stands still, or the value drifts.
+`WINDOWS` samples run at the same time. `PERSISTENT` samples in a row beyond the bound are evidence of an error: a sign
+is wrong, a scale is wrong by more than s, one of the two stands still, or the value drifts.
 
-s is 10 %, and 35 % for an arm with a mode whose phase turns by more than a radian in a sample: the rule misses its
-swings, but still finds a factor of two. If a mode turns by more than `ALIASED`, the next one, which the model may not
-have, can be near the sampling frequency. A light joint that swings with it is in the same phase in many samples in a
-row, and its velocity then differs from the mean motion of its position. In this case s counts only from `LONG` samples
-of a window on; before, it is 1, which finds only a wrong sign.
+s is 10 %. It is 35 % if the phase of a mode turns by more than a radian in a sample: then the rule misses this mode's
+swings, but the check still finds a factor of two. If the phase of a mode turns by more than `ALIASED` in a sample, the
+next mode, which the model may not have, can be near the sampling frequency. A light joint that swings with it is in the
+same phase in many samples in a row, and its velocity then differs from the mean motion of its position. In this case s
+counts only once a window has `LONG` samples; before, s is 1, which finds only a wrong sign.
 """
 
 import numpy as np
@@ -32,9 +32,10 @@ WINDOWS = (20, 200)
 PERSISTENT = 4
 #: Ratio by which a rate may be wrong [-].
 SCALE = 0.1
-#: The same, and the factor of what the trapezoidal rule can miss, for modes that are fast for the sampling [-].
+#: For modes that are fast for the sampling: the same ratio, and a factor on what the trapezoidal rule can miss [-].
 FAST_SCALE, FAST_MISSED = 0.35, 2.0
-#: Phase of a mode per sample from which on the next mode may be aliased [rad], and samples from which a window counts.
+#: If a mode's phase turns by more than this per sample, the next mode may be aliased [rad]; number of samples from
+#: which on a window then counts fully.
 ALIASED, LONG = 2.0, 100
 #: Delay of a rate that its source has filtered [s].
 LATE = 0.005

@@ -8,10 +8,10 @@ for :math:`R W\varepsilon` with its inverse W, without the part that no amplitud
 
 .. math:: |d - d_0| \le Z\varepsilon_{max} + S\,\widehat{|s - s_0|} + \tau\,\widehat{|\dot s|}
 
-The bound allows 0.6 % of full scale (Z), half of the strain (S = `SHARE`: another model's shapes or a gauge's gain
-cause less, a wrong sign or a factor of two more), and the delay :math:`\tau` (`LATE`) of a source that filters. The hat
-is the largest value over all gauges in the last `KEPT` seconds or so. `PERSISTENT` samples in a row beyond the bound
-are evidence. This does not show which of the two is wrong.
+The bound allows 0.6 % of full scale (Z), half of the strain (S = `SHARE`), and the delay :math:`\tau` (`LATE`) of a
+source that filters. Another model's shapes or a gauge's gain cause a difference below S, a wrong sign or a factor of
+two one above it. The hat is the largest value over all gauges in the last `KEPT` seconds or so. `PERSISTENT` samples in
+a row beyond the bound are evidence. This does not show which of the two is wrong.
 """
 
 from math import exp

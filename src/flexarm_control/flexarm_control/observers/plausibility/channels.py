@@ -8,18 +8,18 @@ strain map, a step :math:`\Delta u` of the torque changes the accelerations by
 .. math:: |\Delta\ddot q| \le 2|H_{11}||\Delta u|, \qquad |\Delta\ddot\delta| \le 2|H_{21}||\Delta u|, \qquad
           |\Delta\ddot\varepsilon| \le 2|R H_{21}||\Delta u| ,
 
-where the 2 allows for errors of the model. The end of a light link has hardly any inertia of its own, so that a motor
-on it turns back by modes that the arm file leaves out. Gauges feel these modes, too. So for an arm with a light joint
-the bounds of what joints and gauges show are also computed with one mode more in every direction, and with the mean
-acceleration that a constant torque causes over a time t instead of H:
+where the 2 allows for errors of the model. The end of a light link has hardly any inertia of its own. A motor on it is
+therefore turned back by modes that the arm file leaves out. Gauges feel these modes, too. So for an arm with a light
+joint the bounds for joints and gauges are also computed in a second way: with one more mode in every direction and,
+instead of H, with the mean acceleration that a constant torque causes over a time t:
 
 .. math:: \bar H = \begin{pmatrix} M_{11}^{-1} & 0 \\ 0 & 0 \end{pmatrix}
           + \sum_k s_k^2\,\phi_k\phi_k^T , \qquad s_k = \frac{\sin(\omega_k t/2)}{\omega_k t/2}
 
 with the normal modes :math:`\phi_k` of unit modal mass and their frequencies :math:`\omega_k`. So positions move by
 :math:`\tfrac12 t^2\bar H\Delta u` in the time t. Velocities change in half of that time by
-:math:`\tfrac12 t\bar H\Delta u` with s_k instead of its square. The larger bound holds. Without the average the sum
-would grow with each mode; with it, it converges. The time t is for up to 1000 samples per second.
+:math:`\tfrac12 t\bar H\Delta u` with s_k instead of its square. The larger of the two bounds holds. Without the average
+the sum would grow with each mode; with it, it converges. The time t fits sampling at up to 1000 samples per second.
 
 Everything else that acts (pushes, gravity, brakes) is assumed to change the joints' accelerations by at most
 :math:`2|M_{11}^{-1}|u_{max}`, with the torque limit or the brake's torque, whichever is larger. The accelerations of
@@ -35,15 +35,16 @@ from flexarm_dynamics.arm.strain_map import reading_rows
 from ... import kernels
 
 #: Rms noise if the arm file states none: joint positions [rad], joint velocities [rad/s], and strains as a
-#: fraction of full scale [-]. If the first samples show more, that is taken.
+#: fraction of full scale [-]. If the first samples show more noise, that counts.
 UNSTATED_POSITION, UNSTATED_VELOCITY, UNSTATED_STRAIN = 1e-5, 1e-3, 1e-5
 #: The same for modal amplitudes of an arm without gauges [m, rad].
 UNSTATED_AMPLITUDE = 1e-5
-#: Factor for a payload, a configuration or a torque between two samples that is not the model's [-].
+#: Factor for a payload, a configuration, or a torque between two samples, that differs from the model's [-].
 MARGIN = 2.0
 #: Time over which accelerations after a step of the torque are averaged: two samples at 1 kHz [s].
 AVERAGED = 2e-3
-#: A joint with a larger ratio of flexible to rigid accelerations turns hardly more than the end of a bending link [-].
+#: A joint is light if the ratio of its acceleration with flexible links to that with rigid links is larger [-]. It then
+#: turns little more than the end of a bending link.
 LIGHT = 3.0
 #: Number of configurations over which the largest accelerations are taken.
 CONFIGURATIONS = 16
@@ -76,12 +77,13 @@ class Channels:
     count : ndarray, shape (n,)
         Steps of the encoders; zero where the arm file states none [rad].
     gain : ndarray, shape (N, n)
-        Change of acceleration per torque, in magnitude, `MARGIN` times the largest over the configurations, of the
-        model and, with a light joint, of the mean with a mode more.
+        Magnitude of the change of acceleration per torque: `MARGIN` times the largest over the configurations. With a
+        light joint, the mean acceleration with one more mode counts if it is larger than the model's.
     push : ndarray, shape (N,)
         Change of acceleration by causes that are not reported; infinite if a joint has no torque limit.
     heavy : bool
-        Whether no joint accelerates more than `LIGHT` times faster than if the links were rigid, in any configuration.
+        Whether no joint is light: none accelerates more than `LIGHT` times as much as with rigid links, in any of the
+        configurations.
     strength : ndarray, shape (n,)
         Largest torque of motor or brake [N m].
     """
@@ -185,7 +187,7 @@ def _largest(arrays):
 
 
 def mean_accelerations(model, q, time, of_velocity=False):
-    """Mean accelerations after a step of the torques, per torque: the two blocks of the module's H, averaged.
+    """Mean accelerations after a step of the torques, per torque: the two blocks of the module's averaged H.
 
     Parameters
     ----------
@@ -194,9 +196,9 @@ def mean_accelerations(model, q, time, of_velocity=False):
     q : ndarray, shape (n,)
         Joint angles [rad].
     time : float
-        A motion from rest covers half of them times this time's square [s].
+        Time t over which they are averaged: a motion from rest covers half of them times its square [s].
     of_velocity : bool
-        The mean over half of the time, for what the velocities then are.
+        Whether to average over half of the time, for the change of the velocities.
 
     Returns
     -------

@@ -10,9 +10,10 @@ With the time h to the last sample and T the baseline of the slope s, :math:`\rh
 with the noise :math:`\sigma`, the encoder's step c, the stamps' jitter J (the largest recent deviation from the
 mean period), the accelerations a and :math:`G|\Delta u|` of `channels`, and S = h(h+T)/2 for positions, (h+T)/2 for
 rates. e is the largest excess of :math:`|r|/S` over the noise in the last 20 ms or so, since a motion that has begun
-may go on. A torque that is unknown, or zero on every joint, so that brakes may act, counts as a step of the largest
-torque. So do lost samples for the links; for the joints they count as `UNREPORTED` of it. The noise is the larger of
-the value in `channels` and the rms of r so far. The first `LEARNT` samples are not judged.
+may go on. If the torque is unknown, or zero on every joint, so that brakes may act, :math:`\Delta u` is the largest
+torque. Lost samples count as such a step, too, for the links; for the joints they count as the fraction `UNREPORTED` of
+it. The noise is the larger of the value in `channels` and the rms of r so far. The first `LEARNT` samples are not
+judged.
 
 A reading beyond its bound is replaced by the line, for `BRIDGED` samples in a row; after that the jump counts as real.
 """
@@ -27,18 +28,18 @@ from ...kernels import readings
 
 #: Number of samples in a row whose reading is replaced; at the next one the jump counts as lasting.
 BRIDGED = 3
-#: Number of samples after a start that only show the noise.
+#: Number of samples after a start that serve only to learn the noise.
 LEARNT = 50
 #: A bound is this many standard deviations [-], and this multiple of the excess [-].
 DEVIATIONS, GROWTH = 6.0, 2.0
 #: Times in which an excess, and one bridged reading, are forgotten [s].
 EXCESS_TIME, RARE_TIME = 0.02, 1.0
-#: More bridged readings of one sensor than this, each forgotten in `RARE_TIME`, are no single outliers.
+#: If more readings of one sensor than this are bridged, each forgotten in `RARE_TIME`, they are no single outliers.
 FREQUENT = 8.0
-#: Deflections can't be extrapolated over more lost samples in a row, nor over a gap in which the phase of the fastest
-#: mode turns by more than this [rad].
+#: Deflections can't be extrapolated over more than this many samples, lost ones included. Nor can they over a gap with
+#: lost samples in which the phase of the fastest mode turns by more than this [rad].
 MAX_STEPS, MAX_TURN = 3, 0.5
-#: Fraction of the largest torque that may have acted on the joints in lost samples, unreported [-].
+#: Fraction of the largest torque that may have acted on the joints, unreported, in lost samples [-].
 UNREPORTED = 0.1
 
 
@@ -57,7 +58,7 @@ class Jumps:
 
     def __init__(self, channels):
         self.channels = c = channels
-        # A slope over several samples is worth its delay only if readings are rounded.
+        # A slope over several samples has a delay, which is worth it only if readings are rounded.
         self.span = 4 if c.count.any() else 1
         self.bridged = np.zeros(c.size, int)
         # Joints are extrapolated over any number of lost samples.
@@ -93,7 +94,7 @@ class Jumps:
         )
 
     def judge(self, value, torque, dt, steps):
-        """Judge the readings of a new sample; nothing is remembered of it before `take`.
+        """Judge the readings of a new sample; only `take` remembers them.
 
         Parameters
         ----------

@@ -5,7 +5,7 @@ Three stages, :math:`\dot y_i = \omega(y_{i-1} - y_i)` with the input as :math:`
 
 .. math:: \dot y_3 = \omega(y_2 - y_3), \qquad \ddot y_3 = \omega^2(y_1 - 2y_2 + y_3) .
 
-The input is taken for a straight line between two samples, whatever the time h between them. With
+The input is taken as a straight line between two samples, whatever the time h between them. With
 :math:`x = \omega h`, :math:`e_k = e^{-x}x^k/k!`, the step responses :math:`S_i = 1 - \sum_{k<i}e_k` and the ramp
 responses :math:`R_i = 1 - \frac1x\sum_{k\le i}S_k`, a sample changes the states exactly to
 
@@ -23,7 +23,7 @@ SAME = 1e-3
 
 
 class LowPass:
-    """Filters several signals alike.
+    """Filters several signals in the same way.
 
     Parameters
     ----------
@@ -86,11 +86,11 @@ class LowPass:
 
     @property
     def first(self):
-        """Its derivative, shape (N,)."""
+        """First derivative of `signal`, shape (N,)."""
         return self.corner * (self.rows[3] - self.rows[4])
 
     @property
     def second(self):
-        """Its second derivative, shape (N,)."""
+        """Second derivative of `signal`, shape (N,)."""
         rows = self.rows
         return self.corner**2 * (rows[2] - 2.0 * rows[3] + rows[4])

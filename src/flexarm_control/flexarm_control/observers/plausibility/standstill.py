@@ -5,19 +5,21 @@ A reading is still while it is the same to the last bit. Quantised readings of a
 is a simulated arm that is exactly at rest. Therefore stillness alone is no evidence. It is evidence
 
 1. for a strain gauge, a joint velocity that is not zero, or the whole frame (all joints and gauges), if it lasts
-   `ABRUPT` samples and began abruptly: over the `BEFORE` samples before, the reading changed on average by more
-   than `TIMES` times its smallest change so far, and so it did in one of the last two. A smooth motion that ends, or
-   turns, changes ever less before it is still: by less than twice the step of a converter in a sample. If both of
-   the last two changes are smaller, a fast vibration may be turning, which is not still for twice `ABRUPT` samples.
+   `ABRUPT` samples and began abruptly. Abruptly means: in the `BEFORE` samples before, the reading changed on average
+   by more than `TIMES` times its smallest change so far, and so it did in one of the last two. In a frame, one reading
+   that stops abruptly is enough. A smooth motion that ends or turns changes ever less before it is still: by less than
+   twice the step of a converter in a sample. If both of the last two changes are smaller, a fast vibration may be
+   turning. It does not stay still for twice `ABRUPT` samples, so stillness counts only after these.
 2. for a gauge whose noise is stated and has been seen, if it lasts N samples with :math:`p^N < 10^{-14}`. Here
    :math:`p = \mathrm{erf}(s/2\sqrt2\sigma)` is the probability of the most probable count, with the gauge's step s.
    The noise has been seen if the readings' rms in `jumps` is at least half of it.
-3. for a joint, if the torque should have moved it. Let :math:`\bar u` be the torque less the arm's weight, plus the
+3. for a joint, if the torque should have moved it. Let :math:`\bar u` be the torque minus the arm's weight, plus the
    effect of the bent links on joints that stand, :math:`M_{12}M_{22}^{-1}(K_2\delta + f_2)`. The rigid arm then
-   accelerates by :math:`a = M_{11}^{-1}\bar u`. Friction, and the uncertainty of weight, bending and the gauges' noise,
-   are up to :math:`\Delta u` at each joint, also at those that turn. They may take :math:`|M_{11}^{-1}|\Delta u` from
-   a, since a joint that carries others feels their effect. The rest of a is integrated from when the joint became
-   still: it should have turned by more than `TRAVEL` of its encoder's steps, or of its noise.
+   accelerates by :math:`a = M_{11}^{-1}\bar u`. Friction, the uncertainty of weight and bending, and the gauges' noise
+   amount to at most :math:`\Delta u` at each joint, also at joints that turn. They may reduce a by
+   :math:`|M_{11}^{-1}|\Delta u`, since a joint that carries others feels their effect. What is left of a is integrated
+   twice from the time when the joint became still. There is evidence if this angle is more than `TRAVEL` steps of the
+   joint's encoder, or `TRAVEL` times its noise.
 """
 
 import numpy as np
@@ -28,7 +30,7 @@ from ...arrays import finite, some
 from .channels import UNSTATED_POSITION
 from .jumps import DEVIATIONS
 
-#: Samples that an abrupt stillness lasts until it is noticed; samples before it; and the ratio of changes.
+#: Samples after which an abrupt stillness is noticed; samples before it that are compared; and the ratio of changes.
 ABRUPT, BEFORE, TIMES = 6, 8, 6.0
 #: Number of encoder steps by which the torque must move a joint.
 TRAVEL = 10.0
@@ -36,7 +38,7 @@ TRAVEL = 10.0
 SLIGHT = 1e-6
 #: Probability of a false alarm in one run of samples.
 RARE = 1e-14
-#: Torque that friction not in the arm file may hold, as a fraction of the limit; and uncertain fraction of the weight.
+#: Torque of friction that the arm file may lack, as a fraction of the limit; and uncertain fraction of the weight.
 FRICTION, WEIGHT = 0.05, 0.4
 
 
@@ -146,7 +148,7 @@ class Standstill:
         return joints, gauges, np.flatnonzero(self._found[end:]), frame
 
     def _unmoved(self, position, torque, dt, amplitude):
-        """Joints that the torque should have moved since they have been still."""
+        """Joints that the torque should have moved since they became still."""
         n = self.channels.n
         if not finite(torque):
             return NONE
@@ -161,7 +163,7 @@ class Standstill:
         return np.flatnonzero(found) if moved else NONE
 
     def _hold(self, position):
-        """Set what moves joints that stand in a configuration, (n,), and what holds them."""
+        """Set inertia, weight and effect of the bent links for joints that stand at a `position` (n,) [rad]."""
         n = self.channels.n
         terms = self.channels.model.terms(position, np.zeros(n))
         self._inertia = np.linalg.inv(terms.M[:n, :n])

@@ -15,24 +15,24 @@ pass the same high-pass filter, so that neither the bias of a gauge nor an unkno
 .. math:: r = \frac{\overline{|z + p|^2}}{\overline{|z|^2} + \overline{|p|^2}}
 
 is 0 if they fit, 1 if they have nothing in common, 2 if the sign is wrong; a payload that is 30 % off causes 0.03.
-If r of the gauges on a link is above `MISFIT` for `PERSISTENT` comparisons, the same samples are judged under each
-hypothesis: one gauge or all of a link with the other sign, two gauges exchanged. The one with the smallest r is named
-if its r is `RATIO` times smaller and below `FIT`. Strains that are small compared with their noise, stated or seen,
-are not judged.
+If r of a link's gauges in one direction is above `MISFIT` for `PERSISTENT` comparisons, the same samples are judged
+under each hypothesis: the other sign for one gauge, for all of a link's gauges in one direction, or for all gauges; or
+two gauges exchanged. The hypothesis whose r falls by the largest factor is named if this factor is above `RATIO` and r
+is below `FIT`. Strains that are small compared with their noise, stated or seen, are not judged.
 
-A wiring T may have begun only a moment ago. The low pass is linear. So from the strains since that moment,
-:math:`F[\varepsilon 1_{t\ge t_0}]`, its output would have been
-:math:`F[\varepsilon] + (T - 1)F[\varepsilon 1_{t\ge t_0}]`. Each hypothesis is judged from the beginning, and for
-`ONSETS` moments, `EVERY` apart, that move on with time, so that the filter's memory of right strains does not delay
-the result. If an offset of a single gauge explains the misfit as well, it is left to `zero_drift`. If a positive factor
-of all strains explains it as well, it is no wiring: play and a wrong payload cause such a factor, and so do exchanged
-gauges of a link with one mode. So the misfit of a hypothesis also has the square of what no modes of the link explain
-of its strains, :math:`\varepsilon - RW\varepsilon`: gauges that agree with each other are not exchanged.
+A wrong wiring T may have begun only a moment ago, at :math:`t_0`. The low pass F is linear. So F also filters the
+strains since that moment, :math:`F[\varepsilon 1_{t\ge t_0}]`, and its output with the right wiring would have been
+:math:`F[\varepsilon] + (T - 1)F[\varepsilon 1_{t\ge t_0}]`. Each hypothesis is judged from the beginning, and from
+`ONSETS` moments, `EVERY` apart, that move on with time. Thus the filter's memory of right strains does not delay the
+result. If an offset of a single gauge explains the misfit as well, it is left to `zero_drift`. If a positive factor on
+all strains explains it as well, the wiring is right: play and a wrong payload cause such a factor. Exchanged gauges of
+a link with one mode cause one, too. So the misfit of a hypothesis also contains the square of the strains that no modes
+of the link explain, :math:`\varepsilon - RW\varepsilon`: gauges that agree with each other are not exchanged.
 
-A hypothesis is not accepted if its strains are small compared with what a free oscillation moves. The readings of
-exchanged gauges do not show this, so it is judged with the strains of the hypothesis. Arms with light joints
-(`Channels.heavy`) are not judged: there large inertias cancel in z and p, and a payload that is 30 % off can turn their
-signs.
+A hypothesis is not accepted if the arm mainly oscillates freely, so that z and p are small compared with the strains
+and the inertia in z. The readings of exchanged gauges do not show this, so it is judged with the strains of the
+hypothesis. Arms with light joints (`Channels.heavy` is false) are not judged: there large inertias cancel in z and p,
+and a payload that is 30 % off can reverse their signs.
 """
 
 from itertools import combinations
@@ -55,24 +55,27 @@ SETTLED, GAP = 12.0, 0.7
 INTERVAL, MEMORY, RENEWAL = 0.008, 0.064, 0.04
 #: Misfit above which hypotheses are judged [-], and for how many comparisons.
 MISFIT, PERSISTENT = 0.12, 3
-#: The hypothesis that wins has a misfit below the first value, and smaller than the nominal one by the second [-].
+#: The misfit of the hypothesis that wins is below the first value, and the second value times smaller than the nominal
+#: misfit [-].
 FIT, RATIO = 0.05, 5.0
-#: It is also smaller than that of every other hypothesis by this factor [-], in this many comparisons in a row.
+#: It is also smaller than that of every other hypothesis by this factor [-], and wins this many comparisons in a row.
 DISTINCT, CONFIRMED = 3.0, 3
-#: No wiring wins if the misfit is below `FIT` with all strains of a link larger or smaller, by a factor up to this [-]:
-#: a payload, play or stiffness that the file does not have causes that.
+#: No wiring wins if all strains of a link, larger or smaller by a factor up to this [-], have a misfit below `FIT`: a
+#: payload, play or stiffness that differs from the arm file's causes that.
 SCALE = 2.0
-#: Strains are judged if z and p are this many times larger than their noise, and this fraction of |z - epsilon|.
+#: Strains are judged if z and p are this many times larger than their noise, and at least this fraction of epsilon and
+#: z - R W epsilon together [-].
 CLEAR, DRIVEN = 8.0, 0.5
-#: The strains must also be at least this fraction of z and p: else inertias cancel, and the model is not exact enough.
+#: The strains must also be at least this fraction of z and p [-]: else inertias cancel, and the model is too inexact.
 STRAINED = 0.2
-#: Rms of a low-passed white noise over its own: this times the root of corner and sampling interval [-].
+#: A low pass reduces the rms of white noise by this times the root of corner times sampling interval [-].
 WHITE = np.sqrt(3.0 / 16.0)
 #: Moments at which a wrong wiring may have begun, and the time between them [s].
 ONSETS, EVERY = 8, 0.03
-#: Rounding of times [s], and of squares that are divisors.
+#: Rounding of times [s], and smallest square to divide by.
 ROUNDING, TINY = 1e-9, 1e-300
-#: Encoder counts are not white: largest second derivative of a low-passed step, over its size and corner^2 [-].
+#: Encoder counts are not white noise: this is the largest second derivative of a low-passed step, divided by the step's
+#: size and corner^2 [-].
 STEP = 0.3
 
 
@@ -128,14 +131,14 @@ class StrainLaw:
         self.drift.reset()
 
     def _begin(self, position, velocity):
-        """Begin with this sample, since the samples before a gap do not show the motion in it; the drift is kept."""
+        """Begin with this sample, since samples before a gap do not show the motion in the gap; the drift is kept."""
         g = self.channels.g
         self._sums, self._run = np.zeros((2, g)), np.zeros(g, int)
         self._number = self._samples = self._oldest = self._same = 0
         self._best = None
         self._since = self._until = 0.0
         self._renew(position, velocity)
-        self._low.start(self._now)  # an arm that moves then looks as if it had been hit
+        self._low.start(self._now)  # to the filter, a moving arm looks as if it had been hit
         self._settling = SETTLED / self.corner
 
     def update(self, position, strain, velocity, dt, noise):
@@ -153,8 +156,8 @@ class StrainLaw:
         Returns
         -------
         compared : bool
-            Whether this sample ended an interval, so that `drift` is new. If a gauge is at an end of its range, it is
-            false, and the past is forgotten.
+            Whether this sample ended an interval, so that `drift` is new. If a gauge is at an end of its range, this
+            is false, and the past is forgotten.
         wiring : int or None
             Index of the hypothesis that wins against the arm file's wiring.
         """
@@ -184,7 +187,7 @@ class StrainLaw:
     def _renew(self, position, velocity):
         """Set mass matrix and forces of the present configuration."""
         terms = self.model.terms(position, velocity)
-        if self._inertia is None or self.channels.n > 1:  # that of an arm with a single joint stays
+        if self._inertia is None or self.channels.n > 1:  # of a single joint they stay the same
             self.drive, self._load, self._turn, self._bend = law_matrices(
                 self.model, self._map, terms
             )
@@ -231,7 +234,7 @@ class StrainLaw:
     def _noise_of_law(self):
         """Effect of noise on z and p, summed over a link's gauges, by gauge."""
         c, w = self.channels, self.corner
-        left = WHITE**2 * w * self._interval  # of a white noise's square
+        left = WHITE**2 * w * self._interval  # fraction of a white noise's variance
         gauge = left * np.maximum(c.noise[c.strain], self._noise) ** 2
         encoder = self._of_counts + left * self._of_position
         return self._kernels.noise_of_law(
@@ -260,7 +263,7 @@ class StrainLaw:
         gain = np.where(asked & (rest < FIT), nominal / rest, 0.0)
         best = int(np.argmax(gain))
         self.misfits = float(nominal[best]), float(rest[best])
-        # An offset of one gauge explains as much as its mean residual; a zero that drifts is no wrong wiring.
+        # An offset of one gauge explains as much as the gauge's mean residual; a drifting zero is no wrong wiring.
         residual, concerned = z + p, self._concerned[best]
         offset = concerned * residual.mean(axis=0) ** 2
         left = concerned @ (residual**2).mean(axis=0) - offset.max()
@@ -273,14 +276,14 @@ class StrainLaw:
         return best if self._same >= CONFIRMED else None
 
     def _explained(self, read):
-        """Parts of z by strains and their first and second derivatives, (3, ..., g) each."""
+        """Parts of z from the strains, their first and their second derivatives, (3, ..., g)."""
         return np.stack([read[0] @ self._project.T, read[1] @ self._turn.T, read[2] @ self._load.T])
 
     def _fit(self, read, p):
         """Misfit of each hypothesis' strains and derivatives, (3, h, kept, g); infinite where inertias cancel."""
         parts = self._explained(read)
         z, moved = parts.sum(axis=0), parts[1:].sum(axis=0)
-        # What no modes of a link explain of what its gauges show together.
+        # The part of a link's strains that none of its modes explain.
         alone = read[0] - parts[0]
         parts = (z + p) ** 2 + alone**2, z * z + p * p, read[0] ** 2, moved**2
         misfit, total, still, swing = (
@@ -291,7 +294,7 @@ class StrainLaw:
 
 
 def _scaled(z, p):
-    """Misfit that is left when the strains are larger or smaller by the best factor within `SCALE`."""
+    """Misfit that is left if the strains are multiplied by the best factor within `SCALE`."""
     zz, pp, zp = (float(np.sum(part)) for part in (z * z, p * p, z * p))
     factor = min(max(-zp / zz, 1.0 / SCALE), SCALE) if zz > 0.0 else 1.0
     return (factor**2 * zz + 2.0 * factor * zp + pp) / max(factor**2 * zz + pp, TINY)

@@ -7,7 +7,7 @@ links' own inertia do not explain,
 .. math:: r = \varepsilon - R\delta_p, \qquad R\delta_p = -(R K_2^{-1}(M_{22}\ddot\delta + C_2\dot\delta) + p),
 
 r passes a low-pass filter with the time constant :math:`\tau` (`SLOW`). The result is compared with the zero
-:math:`r_0`, which is its mean over the first `LEARNT` seconds in which the arm hardly accelerates:
+:math:`r_0`, the mean of r over the first `LEARNT` seconds in which the arm hardly accelerates:
 
 .. math::
     |\bar r - r_0| \le Z\varepsilon_{max} + \Pi\,
@@ -15,20 +15,21 @@ r passes a low-pass filter with the time constant :math:`\tau` (`SLOW`). The res
 
 with 0.6 % of full scale for the zero (Z = `ZERO`). :math:`\Delta D`, :math:`\Delta L` and :math:`\Delta W` are the
 largest changes of :math:`R K_2^{-1}M_{21}`, :math:`R K_2^{-1}M_{22}W` and the weight's strain, over some
-configurations, for a payload that is off by `payload_tolerance`; :math:`\Pi` is `MARGIN`. The bound does not contain
-noise: the low pass leaves less than a tenth of a gauge's noise, and less than half a microstrain of encoder counts.
+configurations, for a payload that is off by `payload_tolerance`; :math:`\Pi` is `MARGIN`. The sum over the joints
+counts up to 2 rad. The bound does not contain noise: the low pass leaves less than a tenth of a gauge's noise, and less
+than half a microstrain of encoder counts.
 
-A zero that drifts at the rate v is found when it has left its bound b by :math:`v\tau`,
+A zero that drifts at the rate v is found when it is beyond its bound b by :math:`v\tau`,
 
 .. math:: t = b/v + \tau + 3/\omega_f ,
 
 with the corner :math:`\omega_f` of the law's low pass. This is no later than :math:`\tau + 3/\omega_f` after it has
-left the bound, whatever the rate v. A drift within the bound looks the same as another payload. From then on r minus
-its zero is subtracted from the reading, late by `CORRECTED` + :math:`3/\omega_f`; v times this delay is left of a
-drift.
+left the bound, whatever the rate v. A drift within the bound looks the same as another payload. If a gauge that
+drifts can't be left out, r minus its zero is subtracted from its reading from then on, with a delay of `CORRECTED` +
+:math:`3/\omega_f`; v times this delay remains.
 
-If all residuals together are those of a wrong acceleration of one joint, :math:`r = R K_2^{-1}M_{21}a`, its position
-may be wrong as well as the strains, or something pushes the arm. Joint and gauges are then named together.
+If a wrong acceleration a of one joint explains all residuals together, :math:`r = R K_2^{-1}M_{21}a`, the error may be
+in this joint's position or in the strains, or something pushes the arm. Joint and gauges are then named together.
 """
 
 from math import exp
@@ -73,7 +74,7 @@ class ZeroDrift:
     doubted : ndarray of bool, shape (g,)
         Gauges whose drift is taken out of the amplitudes; the monitor sets it.
     correction : ndarray, shape (g,)
-        Subtracted from the readings; it follows the residual of those that are doubted, r minus its zero [strain].
+        Subtracted from the readings; for doubted gauges it follows r minus its zero [strain].
     """
 
     def __init__(self, channels, strain_map, payload=TOLERANCE):
@@ -105,7 +106,7 @@ class ZeroDrift:
         acceleration : ndarray, shape (g + n,)
             Second derivatives of strains and joint positions.
         position : ndarray, shape (n,)
-            Joint positions, filtered alike [rad].
+            Joint positions, filtered in the same way [rad].
         dt : float
             Time since the last comparison [s].
         """
@@ -140,12 +141,12 @@ class ZeroDrift:
 
 
 def law_matrices(model, strain_map, terms):
-    """Strain on the gauges by what bends the links: `terms` through a `strain_map` of the `model`.
+    """Strains at the gauges per cause of bending, from `terms` and a `strain_map` of the `model`.
 
     Returns
     -------
     drive, load, turn, force : ndarray, shape (g, n), (g, g), (g, g), (g, m)
-        Strain per joint acceleration, per second and per first derivative of the strains, and per modal force.
+        Strain per joint acceleration, per second derivative of the strains, per first one, and per modal force.
     """
     n = model.n_joints
     to_strain = strain_map.rows @ np.linalg.inv(terms.K2)
@@ -172,7 +173,7 @@ def _payload_changes(model, strain_map, payload):
 
 
 def _at_rest(model, strain_map, q):
-    """`law_matrices` at rest, the last one times f2: the weight's strain."""
+    """The first two `law_matrices` at rest, and the weight's strain: the last matrix times f2."""
     terms = model.terms(q, np.zeros(q.size))
     drive, load, _, to_strain = law_matrices(model, strain_map, terms)
     return drive, load, to_strain @ terms.f2
