@@ -13,7 +13,7 @@ class Component:
     """A part of the control that is found by name, designed once, and called once per sample.
 
     The constructor does all design work. `reset` begins a session. After a redesign, `resume` lets the new component
-    go on from the old one's states. A component without states of its own has nothing to do in either.
+    go on from the old one's states. A component without states of its own implements neither.
 
     Parameters
     ----------

@@ -7,7 +7,8 @@ r"""Gains that change with the configuration: a weighted mean of several sets, e
 
 This is the interpolation of Shepard (1968): in the configuration of set k, K is K_k and its derivative is zero. The sum
 over j includes only joints that change the arm's equations; the first joint of a planar arm without gravity does not.
-At rest without error the derivatives of K multiply zero. So the linearised loop in a configuration q is that of K(q).
+At rest without error the derivatives of K multiply zero. So the loop linearised in a configuration q is the loop with
+the constant gain K(q).
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Defines the errors that flexarm raises; each of them is a `FlexarmError`.
 
-An error carries what a program or a test needs (`field`, `value`, `limit`, `hint`). Its text for people always has the
-form ``field: value problem (limit); hint``, without the parts that are not given.
+An error carries what a program or a test needs (`field`, `value`, `limit`, `hint`). Its text for the user always has
+the form ``field: value problem (limit); hint``, without the parts that are not given.
 """
 
 import numpy as np
@@ -33,11 +33,11 @@ class FlexarmError(Exception):
     problem : str
         What is wrong. With a `value`, the words that follow it: "is not finite".
     field : str, optional
-        The parameter, field of a file or message, joint or mode that it is about, by its full name.
+        Full name of the parameter, field of a file or message, joint or mode that has the problem.
     value : object, optional
-        What was found there.
+        The value found there.
     limit : object, optional
-        What would have been allowed: a number, a range or a list of names.
+        What is allowed: a number, a range or a list of names.
     hint : str, optional
         What the user can do.
 
@@ -67,7 +67,7 @@ class FlexarmError(Exception):
         return f"{text}; {self.hint}" if self.hint else text
 
     def __reduce__(self):
-        """Make errors keep all that they carry when they are sent to another process."""
+        """Keep all attributes of an error that is sent to another process."""
         return _again, (type(self), vars(self))
 
 
@@ -113,7 +113,7 @@ class UnknownComponentError(FlexarmError):
 
 
 def check_shape(array, shape, field):
-    """Refuse an array of another shape; `field` is what the error calls it.
+    """Refuse an array of another shape; the error calls it `field`.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def check_shape(array, shape, field):
 
 
 def check_finite(values, names, field):
-    """Refuse measurements that are not finite or beyond any arm's.
+    """Refuse measurements that are not finite, or too large for any arm.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def check_finite(values, names, field):
         Naming the first bad value and its joint or mode.
     """
     if values.dot(values) < MAX_MEASUREMENT:
-        return  # true for every usable sample; this product costs a third of what follows
+        return  # true for ordinary samples; this product costs a third of the check below
     if not np.abs(values).max(initial=0.0) < MAX_MEASUREMENT:  # false for NaN too
         i = int(np.argmin(np.abs(values) < MAX_MEASUREMENT))
         value, where = float(values[i]), f"{field} of {names[i]}"

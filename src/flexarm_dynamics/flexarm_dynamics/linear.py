@@ -40,13 +40,13 @@ def jacobian(function, x, step=STEP):
     for i in range(x.size):
         move = np.zeros(x.size)
         move[i] = step
-        ahead = np.array(function(x + move))  # a copy: it may be an array that is used again
+        ahead = np.array(function(x + move))  # a copy: the function may reuse its array
         columns.append((ahead - function(x - move)) / (2.0 * step))
     return np.stack(columns, axis=1) if columns else np.zeros((np.size(function(x)), 0))
 
 
 def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
-    """A of the arm (2) linearised in a state (q, delta, qd, delta_d) under a torque.
+    """A of the arm (2), linearised at a state (q, delta, qd, delta_d) under a torque.
 
     Parameters
     ----------
@@ -55,10 +55,10 @@ def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
     torque : ndarray, shape (n,), or 0.0
         [N m]
     coulomb : bool
-        True: Coulomb friction is as steep as its smoothing makes it at rest; a law that compensates friction assumes
-        the same. False: viscous friction only, as when the arm moves.
+        True: Coulomb friction has the derivative of its smoothed form, largest at rest; a law that compensates friction
+        assumes the same. False: viscous friction only, as when the arm moves.
     step : float
-        Of the differences.
+        Step of the differences.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
 
     def derivative(s):
         u = torque
-        if not coulomb:  # the model's friction taken out, and its viscous part put back
+        if not coulomb:  # remove the model's friction, and add its viscous part again
             delta, qd, delta_d = s[n:half], s[half : half + n], s[half + n :]
             u = u + model.friction(qd, delta, delta_d) - viscous * qd
         return model.derivative(s, u)
@@ -80,7 +80,7 @@ def state_matrix(model, state, torque=0.0, coulomb=True, step=STEP):
 
 
 def linear_plant(model, q, coulomb=True):
-    """The arm (2) linearised at rest, held by its torque against gravity; play is taken as closed.
+    """The arm (2), linearised at rest, with the torque that holds it against gravity and all play closed.
 
     Parameters
     ----------
@@ -93,12 +93,12 @@ def linear_plant(model, q, coulomb=True):
     Returns
     -------
     A, B : ndarray, shape (2 (n + m), 2 (n + m)), (2 (n + m), n)
-        Of the state (q, delta, qd, delta_d) and the joint torque.
+        For the state (q, delta, qd, delta_d) and the joint torque.
     """
     model = model.without_play()
     n, rest, hold = model.n_joints, state_at_rest(model, q), static_torque(model, q)
     A = state_matrix(model, rest, hold, coulomb)
-    # The arm is exactly linear in the torque: a step of one.
+    # The arm is exactly linear in the torque, so a step of one is exact.
     B = jacobian(lambda u: model.derivative(rest, hold + u), np.zeros(n), step=1.0)
     return A, B
 
@@ -131,8 +131,7 @@ def moving_plant(model, q, velocity, acceleration):
     free = np.array(model.derivative(state, np.zeros(n)))
     B = jacobian(lambda u: model.derivative(state, u), np.zeros(n), step=1.0)
     torque = np.linalg.solve(B[joints], acceleration - free[joints])
-    # `state_matrix` has viscous friction alone. Coulomb friction takes the same torque all the time, its value at this
-    # speed.
+    # `state_matrix` has only viscous friction. All other friction takes a constant torque, its value at this speed.
     taken = model.friction(velocity, state[n : n + m], np.zeros(m))
     torque -= taken - model.friction_table()[:, 0] * velocity
     return state_matrix(model, state, torque, coulomb=False), B
@@ -148,10 +147,10 @@ def softened(model, q, A, place, transmission, fraction):
         [rad]
     A : ndarray, shape (2 (n + m), 2 (n + m))
     place : int
-        Of the transmission's deflection in (q, delta).
+        Index of the transmission's deflection in (q, delta).
     transmission : Transmission
     fraction : float
-        What is left [-].
+        Fraction that remains [-].
 
     Returns
     -------
@@ -221,8 +220,8 @@ def sampled_noise(A, density, period):
     ndarray, shape (N, N)
         Symmetric.
     """
-    # Van Loan's exponential contains e^(-At), which grows: compute it over a step in which no mode decays much, then
-    # double.
+    # Van Loan's exponential contains e^(-At), which grows. So compute it over a step in which no mode decays much, and
+    # double the step until it has the length of the period.
     N = A.shape[0]
     fastest = np.abs(np.linalg.eigvals(A)).max()
     doublings = max(0, int(np.ceil(np.log2(max(fastest * period, 1.0)))))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declares parameters: one declaration gives type, unit, range, default and description.
 
-The validation, the ROS parameter descriptors and the tables in the documentation come from it. Nothing here knows ROS.
+The validation, the ROS parameter descriptors and the tables in the documentation come from it. Nothing here uses ROS.
 """
 
 import math
@@ -17,7 +17,7 @@ from .shown import show
 
 _KIND_OF = {float: "float", int: "int", bool: "bool", str: "string"}
 KINDS = ("float", "int", "bool", "string", "float_array", "int_array", "string_array")
-#: At the end of a length's name: any number of sets of that length.
+#: At the end of a length's name: the array may have any number of sets of that length.
 SETS = "*"
 #: A number that YAML reads as a string.
 POWER_OF_TEN = re.compile(r"[+-]?\d+(\.\d*)?[eE][+-]?\d+")
@@ -34,11 +34,11 @@ class Parameter:
     kind : str
         One of `KINDS`.
     default : object
-        The default. A float array of one element means this value in every place.
+        The default. In a float array, a single element stands for all elements.
     description : str
         What it does, in a sentence.
     unit : str
-        The unit, `-` for none.
+        The unit; `-` if there is none.
     low, high : float, optional
         Closed range of every element.
     choices : tuple of str, optional
@@ -67,7 +67,7 @@ class Parameter:
         return replace(self, description=text)
 
     def check(self, value, sizes: Mapping[str, int] | None = None, prefix: str = ""):
-        """Return `value` in its canonical type, or say why it can't be used.
+        """Return `value` in its canonical type, or raise an error if it can't be used.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class Parameter:
         sizes : mapping, optional
             Lengths by name, for arrays whose `length` is a name.
         prefix : str
-            Put before the name in error messages.
+            Prefix of the name in error messages.
 
         Returns
         -------
@@ -170,7 +170,7 @@ class Parameter:
 
 
 def parameter(name, default, unit="-", low=None, high=None, *, kind=None, **options):
-    """Declare a parameter in three lines; its kind follows from the default.
+    """Declare a parameter; its kind follows from the default.
 
     Parameters
     ----------
@@ -204,17 +204,17 @@ def _refusal(where, value, problem, **more):
 
 
 def _listed(where, value, what):
-    """The entries of a list, an array or the like."""
+    """The entries of a list, an array or another sequence."""
     if not isinstance(value, str) and hasattr(value, "__len__"):
         try:
             return list(value)
-        except TypeError:  # an array without dimensions has a length in name only
+        except TypeError:  # a NumPy array without dimensions has `__len__`, but no length
             pass
     raise _refusal(where, value, f"is not a list of {what}")
 
 
 def _is_finite(value):
-    """Whether a float holds it; an integer or a fraction may be too large for one."""
+    """Whether it is finite as a float; an integer or a fraction may be too large for a float."""
     try:
         return math.isfinite(value)
     except OverflowError:
@@ -236,13 +236,13 @@ def check_all(declared, values, sizes=None, prefix=""):
     Parameters
     ----------
     declared : sequence of Parameter
-        What there may be.
+        The parameters that there are.
     values : mapping
-        Name to value; what is missing takes its default.
+        Name to value; a missing parameter takes its default.
     sizes : mapping, optional
         Lengths by name.
     prefix : str
-        Put before names in error messages.
+        Prefix of names in error messages.
 
     Returns
     -------
@@ -264,16 +264,17 @@ def check_all(declared, values, sizes=None, prefix=""):
 
 
 def merge(*groups):
-    """Merge declarations of several components under one prefix; a name has one meaning.
+    """Merge declarations of several components under one prefix; a name must have one meaning.
 
-    If one component takes several sets and another a single set, the name takes several; each component checks its own.
+    If one component takes several sets and another a single set, the merged parameter takes several. Each component
+    checks its own value.
 
     `groups` are sequences of `Parameter`.
 
     Raises
     ------
     ParameterError
-        When two components declare a name differently.
+        If two components declare a name differently.
     """
     merged: dict[str, Parameter] = {}
     for group in groups:
@@ -291,7 +292,7 @@ def merge(*groups):
 
 
 def _meaning(parameter):
-    """What two declarations of one name must have in common."""
+    """What must be equal in two declarations of one name."""
     length = parameter.length
     return (
         parameter.kind,

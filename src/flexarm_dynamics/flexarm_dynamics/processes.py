@@ -8,8 +8,8 @@ import signal
 import sys
 
 _PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
-#: What a linear algebra library reads when it is loaded. With several threads, processes that work on small matrices
-#: slow each other down: a regulator took six times as long.
+#: Environment variables that linear algebra libraries read when they are loaded. With several threads, processes that
+#: work on small matrices slow each other down: a regulator took six times as long.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -21,9 +21,9 @@ def step_back(niceness, cpus=()):
     Parameters
     ----------
     niceness : int
-        Added to the present one.
+        Added to the current niceness.
     cpus : collection of int
-        CPUs to run on, if the system allows it; empty: those inherited.
+        CPUs to run on, if the system allows it; empty: the inherited ones.
     """
     if hasattr(os, "SCHED_BATCH"):  # Linux
         # Not SCHED_IDLE: on a machine that is always busy such a process would never run.
@@ -36,7 +36,7 @@ def step_back(niceness, cpus=()):
 
 
 def end_with(parent):
-    """End this process as soon as its parent has ended for any reason; on systems other than Linux, do nothing.
+    """End this process as soon as its parent has ended, for any reason. On systems other than Linux, do nothing.
 
     Parameters
     ----------

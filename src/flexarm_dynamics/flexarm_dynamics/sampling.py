@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Samples one linear system exactly over periods that differ from sample to sample, without exponentials.
 
-A loop whose samples get lost, or whose stamps jitter, needs another period at every sample. With :math:`\Phi(h) =
+A loop that loses samples, or whose stamps jitter, needs a different period at every sample. With :math:`\Phi(h) =
 e^{Ah}`, :math:`\Gamma(h) = \int_0^h e^{As}ds` and :math:`Q(h) = \int_0^h e^{As}Se^{A^Ts}ds`, steps add up,
 
 .. math::
     \Phi(h_0 + e) = \Phi(e)\Phi(h_0), \quad \Gamma(h_0 + e) = \Gamma(h_0) + \Phi(h_0)\Gamma(e), \quad
     Q(h_0 + e) = \Phi(e)Q(h_0)\Phi(e)^T + Q(e),
 
-so steps over multiples :math:`h_0` of a short period g come from the one over g by doubling, and are kept. Steps over
-the rest e, below g, and over g itself are Taylor series whose coefficients do not depend on e:
+so the step over a multiple :math:`h_0` of a short period g follows from the step over g by doubling, and is kept. The
+steps over g and over the rest e < g are Taylor series whose coefficients do not depend on e:
 
 .. math::
     \Phi(e) = \sum_k \frac{e^k}{k!}A^k, \quad \Gamma(e) = \sum_k \frac{e^{k+1}}{(k+1)!}A^k, \quad
@@ -17,8 +17,8 @@ the rest e, below g, and over g itself are Taylor series whose coefficients do n
 
 With x = :math:`\|A\|g`, where the norm is taken after balancing, the remainder of the first series after K terms is
 below :math:`x^K/K!\cdot e^x` in the balanced norm, and that of the others below :math:`(2x)^K/K!\cdot e^{2x}` of their
-size. g is chosen so that x is below `REACH`, and K so that both remainders are below `ERROR`. A positive rest only ever
-adds covariances, so nothing cancels.
+size. g is chosen so that x is below `REACH`, and K so that both remainders are below `ERROR`. The rest is not
+negative, so covariances are only added, and nothing cancels.
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ from .linear import sampled, sampled_noise
 REACH, ERROR = 0.5, 1e-17
 #: The short period is one of these [us]: common sampling periods are multiples of them.
 PERIODS = (500, 250, 100, 50, 25, 10, 5, 2, 1)
-#: Multiples of the short period that are kept.
+#: Number of multiples of the short period whose steps are kept.
 KEPT = 24
 
 
@@ -101,7 +101,7 @@ class Sampling:
         return out.reshape(count + 1, -1)
 
     def _multiple(self, k):
-        """The step over k short periods: that over half of them, done twice, and one short step more if k is odd."""
+        """The step over k short periods: the step over half of them twice, and one short step more if k is odd."""
         if k == 1:
             return self._short(self.grid)
         half = self._kept(k // 2)
@@ -127,7 +127,7 @@ class Sampling:
 
 
 def _after(first, then):
-    """The `Step` over one period, `first`, and over another one of the same system after it."""
+    """The `Step` of one system over the period of `first` and then over that of `then`."""
     Gamma = first.Gamma + first.Phi @ then.Gamma
     Q = first.Q
     if Q is not None:

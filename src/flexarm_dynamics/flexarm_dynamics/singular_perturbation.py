@@ -105,7 +105,7 @@ def slow_subsystem(terms):
 def slow_torque(terms, acceleration):
     r"""Torque that gives the slow subsystem (10) an acceleration: :math:`\bar u = B^{-1}(\ddot q - a)`.
 
-    It follows from the joint rows of (2), with the modes at rest by their own rows; nothing is inverted twice:
+    The joint rows of (2) give it, with the deflections at which the modal rows are in balance. M is not inverted:
 
     .. math:: \bar u = M_{11}\ddot q + f_1 - K_1 K_2^{-1}(M_{21}\ddot q + f_2)
 
@@ -132,7 +132,7 @@ def _compiled():
 
 
 def fast_subsystem(terms):
-    """A2 (2m, 2m) and B2 (2m, n) of the boundary layer (11), in the time t (mu taken into A2)."""
+    """A2 (2m, 2m) and B2 (2m, n) of the boundary layer (11), in the time t (mu is included in A2)."""
     s = state_space(terms)
     return s.A2, s.B2
 
@@ -155,7 +155,7 @@ def is_stabilisable(A, B, margin=0.0):
     worst = np.inf
     size = A.shape[0]
     norm = np.linalg.norm(A)
-    # Balance, and scale for each eigenvalue: otherwise stiff modes hide the input's effect on soft ones.
+    # Balance the matrix, and scale for each eigenvalue: otherwise stiff modes hide the input's effect on soft ones.
     balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
     B = B / units[:, None]
     gain = np.linalg.norm(B) or 1.0
@@ -176,7 +176,7 @@ class TimeScales:
     slow, fast : ndarray
         Eigenvalues [rad/s].
     mu : float
-        The paper's estimate of the perturbation parameter: highest slow frequency over smallest fast one.
+        The paper's estimate of the perturbation parameter: highest slow frequency over lowest fast frequency.
     separation : float
         1/mu.
     """
@@ -191,12 +191,12 @@ class TimeScales:
 
     @property
     def separation(self):
-        """1/mu [-]; infinite where the slow subsystem stands still."""
+        """1/mu [-]; infinite if all eigenvalues of the slow subsystem are zero."""
         return float("inf") if self.mu == 0.0 else 1.0 / self.mu
 
 
 def time_scales(terms, kp=None, kv=None, K_f=None):
-    """Eigenvalues of the slow and of the fast subsystem, open or closed.
+    """Eigenvalues of the slow and of the fast subsystem, in open or closed loop.
 
     Parameters
     ----------
@@ -222,15 +222,15 @@ def time_scales(terms, kp=None, kv=None, K_f=None):
 
 
 def full_order_matrix(terms, kp, kv, B_inverse, K_f):
-    r"""Closed-loop matrix of the full order system (2) at rest under the composite control (12).
+    r"""Closed-loop matrix of the full-order system (2) at rest under the composite control (12).
 
-    With :math:`\bar u = B^\dagger(-k_p q - k_v\dot q)`, :math:`u_f = K_f(z - \bar z)` and :math:`\bar z` by (9),
-    the state is (q, delta, qd, delta_d).
+    The control is :math:`\bar u = B^\dagger(-k_p q - k_v\dot q)` and :math:`u_f = K_f(z - \bar z)`, with
+    :math:`\bar z` by (9). The state is (q, delta, qd, delta_d).
 
     Parameters
     ----------
     terms : Terms
-        At rest, without deflections; gravity and friction are taken as compensated.
+        At rest, without deflections; gravity and friction are assumed to be compensated.
     kp, kv : array_like, shape (n,)
         Slow gains [1/s^2], [1/s].
     B_inverse : ndarray, shape (n, n)
@@ -263,7 +263,7 @@ def full_order_matrix(terms, kp, kv, B_inverse, K_f):
 def frequencies_and_damping(eigenvalues):
     """Natural frequency [rad/s] and damping ratio of each conjugate pair or pair of real poles, ascending.
 
-    Real poles are paired by ascending magnitude; a pole that is left alone counts as a pair of equal poles. Unstable
+    Real poles are paired by ascending magnitude; a single one that remains counts as a pair of equal poles. Unstable
     pairs have a negative damping ratio.
 
     The `eigenvalues` are of a real matrix, in any order [rad/s].

@@ -4,9 +4,9 @@ r"""Reads and writes the bytes of messages whose strings and lengths seldom chan
 The middleware carries XCDR1 (OMG DDS-XTypes 1.3, section 7.4.1): four bytes of encapsulation, then the fields one after
 the other, each aligned to its own size, with a length before each string and array. On the control path only numbers
 change from one message to the next. So one message shows where the numbers are. One comparison shows whether another
-message has the same strings and lengths: it compares all bytes as one whole number, without those of numbers and
-padding. Arrays are views of the bytes. rclpy's conversion takes several times as long, because it goes through each
-attribute and string.
+message has the same strings and lengths: it compares all bytes, except numbers and padding, as one large integer.
+Arrays are views of the bytes. rclpy's conversion takes several times as long, because it goes through each attribute
+and string.
 """
 
 import struct
@@ -251,7 +251,7 @@ class Reader:
             return raw
         try:
             return deserialize_message(raw, self._kind)
-        except Exception as error:  # rclpy states none
+        except Exception as error:  # rclpy documents none
             problem = f"can't be read: {error}"
             raise MessageError(
                 problem, field=f"{len(raw)} bytes of {self._kind.__name__}"
@@ -299,7 +299,7 @@ class Writer:
 
 
 def _slots(message):
-    """From a path of fields to that of the slots behind rclpy's properties; each property would be a call of Python."""
+    """Function from a path of fields to that of the slots behind rclpy's properties: it avoids their Python calls."""
 
     def inside(path):
         slots = ".".join(f"_{name}" for name in path.split("."))

@@ -100,9 +100,10 @@ def new_session():
 class Driver(ArmNode):
     """A node between the topics and an arm. Subclasses implement the methods of the first group.
 
-    `read` runs in a thread of its own. All others run in the node's thread, or in that of `read`, under a lock: never
-    two at a time. A driver whose samples come as ROS messages, or that moves on its own grid of time, overrides
-    `connect`, `start` and `stop`. It calls `publish` itself, and `begin_session` if the device has restarted.
+    `read` runs in a thread of its own. `apply` and `make_safe` run in the node's thread, or in that of `read`, under a
+    lock: never two at a time. The other methods of this group run in the node's thread, without the lock. A driver
+    whose samples come as ROS messages, or that moves on its own grid of time, overrides `connect`, `start` and `stop`.
+    It calls `publish` itself, and `begin_session` if the device has restarted.
 
     Parameters
     ----------

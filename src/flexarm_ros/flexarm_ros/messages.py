@@ -276,7 +276,7 @@ class TorqueReader:
         ):
             raise MessageError("is empty", field="torque")
         torque = self._torque
-        if torque.dot(torque) < self.HUGE:  # true for nearly all
+        if torque.dot(torque) < self.HUGE:  # a quick check, true for nearly all torques
             return torque
         if not np.abs(torque).max() < self.HUGE:
             i = int(np.argmin(np.abs(self._torque) < self.HUGE))

@@ -44,7 +44,7 @@ TRANSITIONS = {
 }
 NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 REPORT_EVERY = 10_000_000_000  # [ns]
-#: Work for which the configuration waits is logged after the first of these times, then at intervals of the second [s].
+#: Long work of a configuration is logged after the first of these times, and then at intervals of the second [s].
 FIRST_NOTICE, NEXT_NOTICE = 0.5, 10.0
 
 ARM = parameter("arm", "", read_only=True).described(
@@ -110,8 +110,8 @@ class ArmNode(LifecycleNode):
     def wait_for(self, work, what):
         """For `build`: call the function `work`, which takes long, in a thread of its own, and return its result.
 
-        Meanwhile log and diagnostics state `what` the node does and for how long. If the node starts by itself, its
-        parameters and life cycle are served.
+        Meanwhile the log and the diagnostics report `what` the node does, and for how long. During an autostart, the
+        node's parameters and life cycle are served, too.
 
         Raises
         ------
@@ -258,8 +258,8 @@ class ArmNode(LifecycleNode):
         return True
 
     # rclpy 7.1 of Jazzy lets the error of a wrong transition, for example activate while active, end the process: issue
-    # 1209 of ros2/rclpy. Pull request 1319 fixed it in 8.0.0 (Kilted). The next two methods, of LifecycleNodeMixin by
-    # their names, can go when Jazzy does.
+    # 1209 of ros2/rclpy. Pull request 1319 fixed it in 8.0.0 (Kilted). The next two methods override those of
+    # LifecycleNodeMixin by their mangled names. Remove them when Jazzy is no longer supported.
 
     def _LifecycleNodeMixin__change_state(self, transition_id):
         try:
@@ -339,7 +339,7 @@ class ArmNode(LifecycleNode):
         return max(level, WARN), message, {**values, **shown}
 
     def report(self, text, info=False):
-        """Log a warning or an information: a new text at once, one with only other numbers every ten seconds."""
+        """Log a warning or info: a new text at once, one that differs only in its numbers at most every ten seconds."""
         kind = NUMBER.sub("#", text)
         now = self._steady.now().nanoseconds
         if now - self._reported.get(kind, -REPORT_EVERY) >= REPORT_EVERY:

@@ -50,7 +50,7 @@ def descriptor(parameter):
 
 
 def _give_empty_list(node, name, parameter):
-    """Replace None: ROS hands on a parameter file's ``[]``, which has no type, as None; `ros2 param dump` writes it."""
+    """Replace None by an empty list: ROS reads ``[]`` in a parameter file, as `ros2 param dump` writes it, as None."""
     given = node._parameter_overrides.get(name)
     if given is not None and given.value is None and parameter.kind.endswith("array"):
         node._parameter_overrides[name] = Parameter(name, value=[])
@@ -170,7 +170,7 @@ class NodeParameters:
         return {name: self._node.get_parameter(name).value for name in self._declared}
 
     def _checked(self, given):
-        """The `given` values, by full names, of parameters declared here, checked; the others can't have changed."""
+        """Check the `given` values, by full names; parameters not declared here, such as rclpy's, are left out."""
         values = {}
         for name, value in given.items():
             if name in self._declared:

@@ -34,7 +34,7 @@ class ControlPath:
     period : float, optional
         Time between two calls of `on_period`, in seconds of the steady clock.
     on_period : callable, optional
-        A callback in real time. It is not called later for a period that was missed completely.
+        Called once in each period. A period that was missed completely is left out, not made up for.
 
     Attributes
     ----------

@@ -108,7 +108,7 @@ class Gaps:
     def add(self, session, sequence):
         """Note the number of one sample.
 
-        A new session begins anew. A sample that was sent again, or comes late, does not reduce the count.
+        A new session is no gap: numbers start again. A sample that is sent again or late does not change the count.
 
         `sequence` is the sample's number in its `session`.
         """

@@ -37,8 +37,8 @@ class Arms:
     models : list of ArmModel
         One each.
     states : ndarray, shape (b, 2 (n + m))
-        The present ones; may be written to between two calls. Values that are not finite are beyond the range of the
-        model or the step.
+        The present ones; may be written to between two calls. A state that is not finite has left the range of the
+        model, or the step is too long.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def simulate(models, states, starts, ends, step, substeps=1, method="rk4", worke
     Returns
     -------
     ndarray, shape (b, s + 1, 2 (n + m))
-        Values that are not finite are beyond the range of the model or the step.
+        A state that is not finite has left the range of the model, or the step is too long.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def models_of(given, count):
 
 
 def _check(models, size):
-    """Refuse models of which one does not have states of so many entries."""
+    """Raise a `ShapeError` if the states of a model do not have `size` entries."""
     for arm_model in models:
         entries = 2 * (arm_model.n_joints + arm_model.n_modes)
         if entries != size:

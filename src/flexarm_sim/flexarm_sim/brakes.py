@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Brakes that stick: an arm without drive torque under Coulomb's law without smoothing.
 
-Brake i, of torque :math:`T_i`, gives :math:`-T_i\,\mathrm{sign}\,\dot q_i` while its joint turns. It holds a joint
-at rest with the torque that is needed, up to :math:`T_i`. Let a be the accelerations of the joints at rest without
-their brakes, and H that of (3) for those joints. The brakes' torques :math:`\lambda` are the only ones with
+Brake i, of torque :math:`T_i`, gives :math:`-T_i\,\mathrm{sign}\,\dot q_i` while its joint turns. It holds a joint at
+rest with the torque that is needed, up to :math:`T_i`. Let a be the accelerations of the joints at rest without their
+brakes, and H the block of the inverse mass matrix for those joints, as in (3). The brakes' torques :math:`\lambda` are
+the only ones with
 
 .. math::
     \ddot q = a + H\lambda, \qquad \ddot q_i = 0 \text{ and } |\lambda_i|\le T_i, \quad\text{or}\quad
@@ -32,7 +33,7 @@ SLIVER = 1e-12
 CHECK_INTERVAL = 1e-3
 #: A brake that holds with less than this fraction of its torque need not be solved for again.
 SAFE_FRACTION = 0.8
-#: Limits of loops that end long before.
+#: Maximum numbers of iterations of two loops, which usually end much earlier.
 MAX_PIVOTS, MAX_REFINEMENTS = 100, 80
 
 
@@ -97,7 +98,7 @@ class Brakes:
     def __init__(self, model, period, torque, friction, implicit=False, refinement=1):
         self.model, self.torque, self.friction = model, np.asarray(torque, float), friction
         self.period = period
-        # RK4 in these substeps takes far more of a mode's energy than dop853 would.
+        # RK4 in these substeps dissipates far more of a mode's energy than dop853 would.
         needed = 1 if implicit else integrators.substeps(model, period, "dop853", undamped=True)
         self.substeps = refinement * needed
         self._step = model.lockable_stepper(None if implicit else METHODS["rk4"])

@@ -6,15 +6,15 @@ A drive without fresh torque takes its velocity loop to zero, :math:`-T(t)\tanh(
 
 .. math:: s \approx \tfrac12 v\,t_d + \frac{v^2}{2a},
 
-and bends the links as this acceleration does, or twice as far if it comes at once. The whole torque limit bends arm R
-seven times as far as the move that it ends. Therefore, for each joint:
+and bends the links as this acceleration does, or twice as far if the torque begins suddenly. A stop with the whole
+torque limit bends arm R seven times as far as the move that it ends. Therefore, for each joint:
 
-- T is what stops it within `WAY`, :math:`Jv^2/(2\,\mathrm{WAY})`, with its largest speed v since the safe action
-  began. So a fast motion is stopped with more torque than a slow one, in proportion to its own: a move over 1 rad
-  from rest to rest accelerates as much. T is at least `FRACTION` of, and at most, what the arm allows: the torque
-  limit, and the torque that strains a gauge, by accelerating the rigid arm, to `OF_RANGE` of its full scale. The
-  largest torque that the arm's weight needs in any pose is added, within the torque limit. `damp_torque` in the arm
-  file replaces all of this.
+- T is what stops it within `WAY`, :math:`Jv^2/(2\,\mathrm{WAY})`, with its largest speed v since the safe action began.
+  So a fast motion is stopped with more torque than a slow one, in proportion to the torque of the motion: a move over 1
+  rad from rest to rest accelerates as much. T is at least `FRACTION` of what the arm allows, and at most all of it. The
+  arm allows the smaller of two torques: its torque limit, and the torque that strains a gauge, by accelerating the
+  rigid arm, to `OF_RANGE` of its full scale. The largest torque that the arm's weight needs in any pose is added,
+  within the torque limit. `damp_torque` in the arm file replaces all of this.
 - It grows linearly within :math:`t_d`, half a period of the lowest bending mode with locked joints but at most
   `MAX_TIME`; `damp_time` in the arm file replaces it. The part that bears the weight acts at once, so the arm does not
   drop.
@@ -29,7 +29,7 @@ import numpy as np
 from flexarm_dynamics.arm.strain_map import gauge_rows
 from flexarm_dynamics.singular_perturbation import quasi_steady_state, slow_torque
 
-#: Links that continue to vibrate move a joint that is stopped at a fraction of this speed [rad/s].
+#: v_0: links that continue to vibrate move a stopped joint at only a fraction of this speed [rad/s].
 DAMP_SPEED = 0.05
 #: Where nothing bounds the torque, the rigid arm is stopped at this rate [1/s].
 DAMP_RATE = 10.0
@@ -37,7 +37,7 @@ DAMP_RATE = 10.0
 WAY = 0.35
 #: Minimum torque, as a fraction of what the arm allows; fraction of the gauges' full scale that it allows [-].
 FRACTION, OF_RANGE = 0.2, 0.5
-#: Longest soft start that is chosen here [s].
+#: Maximum duration of the soft start, if the arm file does not give one [s].
 MAX_TIME = 0.25
 #: Number of poses in which the weight is evaluated.
 POSES = 64

@@ -49,7 +49,7 @@ class ArmVectorEnv(object if gymnasium is None else gymnasium.vector.VectorEnv):
     method : str
         One of `integrators.METHODS`; its steps are as long as the stiffest arm allows.
     workers : int, optional
-        Number of threads; default: that of the cores.
+        Number of threads; default: the number of cores.
 
     Attributes
     ----------

@@ -30,7 +30,7 @@ FIELDS = {
     "modal_rate": "mode_names",
 }
 WINDOW = ("from", "for")
-#: What the number of a key may be.
+#: Range of the number of each key.
 RANGES = {
     "from": (0.0, 1e9),
     "at": (0.0, 1e9),
@@ -71,6 +71,8 @@ OTHER_KINDS = {
     "names": {"reorder": ((), ()), "wrong": ((), ())},
 }
 
+#: Latest stamp that a message can hold, in 2038; the earliest is 0, in 1970 [ns].
+LAST_NS = (2**31 - 1) * 1_000_000_000
 #: Faults that begin `at` a time and have no end.
 EVENTS = (("clock", "jump"), ("session", "change"))
 
@@ -229,7 +231,7 @@ class FaultInjector:
     ----------
     faults : tuple of Fault
     session : int
-        What the source itself has added to its session by now: a driver that has restarted.
+        Number by which faults have raised the source's session so far, as a driver that restarts does.
     """
 
     def __init__(self, arm, lines=()):
@@ -328,7 +330,7 @@ class FaultInjector:
             values[where] = {"nan": np.nan, "inf": np.inf, "huge": HUGE}[fault.kind]
 
     def _past(self, number, fault, values, time):
-        """The values from one delay of the fault ago; if there are none so old, the first ones."""
+        """The values as they were one delay of the fault ago; the first ones if none is that old."""
         past = self._kept.setdefault(number, [])
         past.append((time, values.copy()))
         while len(past) > 1 and past[1][0] <= time - fault.get("by", 0.0) + 1e-9:
@@ -390,14 +392,18 @@ def _lost(fault, sequence):
     return fraction >= 1.0 or random.random() < fraction
 
 
+def _shift_stamp(out, by):
+    """Shift the stamp of a sample by a time [s], as far as a message can hold it."""
+    out.stamp_ns = min(max(0, out.stamp_ns + round(1e9 * by)), LAST_NS)
+
+
 def _whole_fault(fault, out):
     """Apply a fault of stamps or names."""
     if fault.signal == "clock" or fault.kind == "future":
-        # A message can't hold a stamp before 1970.
-        out.stamp_ns = max(0, out.stamp_ns + round(1e9 * fault.get("by", 0.0)))
+        _shift_stamp(out, fault.get("by", 0.0))
     elif fault.kind == "jitter":
         random = np.random.default_rng([fault.get("seed", 0), out.sequence])
-        out.stamp_ns += round(1e9 * fault.get("by", 0.0) * random.uniform(-1.0, 1.0))
+        _shift_stamp(out, fault.get("by", 0.0) * random.uniform(-1.0, 1.0))
     elif (fault.signal, fault.kind) == ("session", "change"):
         out.session += 1
     elif fault.signal == "names" and fault.kind == "wrong":

@@ -12,8 +12,8 @@ __all__ = [
     "straight_mass_matrix", "substeps", "turning_rate",
 ]  # fmt: skip
 
-#: Largest product of an explicit method's substep and the rate at which friction damps a joint that reverses, and
-#: largest factor by which this increases the number of substeps: in longer substeps light joints hunt [-].
+#: Maximum of an explicit method's substep times the rate at which friction damps a joint that reverses: in longer
+#: substeps light joints hunt. Maximum factor by which this increases the number of substeps [-].
 FRICTION_PER_STEP, MOST = 2.0, 16
 
 

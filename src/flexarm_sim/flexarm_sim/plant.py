@@ -82,7 +82,7 @@ class Plant:
         torque : ndarray, shape (n,)
             [N m]
         damping : ndarray, shape (n,)
-            [N m s/rad]; the same array in every call, unchanged.
+            [N m s/rad]; pass the same array in every call, and do not change it.
         fraction : float
             [-]
 
@@ -172,7 +172,7 @@ class Plant:
     def _brake_torque(self, joint, inertia):
         if joint.brake_torque is not None:
             return joint.brake_torque
-        # If not given: the torque that stops the rigid arm from 1 rad/s in 0.1 s.
+        # If not given: the torque limit; without one, the torque that stops the rigid arm from 1 rad/s in 0.1 s.
         return joint.limits.torque if np.isfinite(joint.limits.torque) else 10.0 * inertia
 
     def _inertia(self):

@@ -76,7 +76,7 @@ class PositionLoop:
     Parameters
     ----------
     model : ArmModel
-        As the drives know it: inertia, weight and torque limits.
+        The drives' model of the arm: inertia, weight and torque limits.
     period : float
         Sample period of the simulated arm [s].
     settings : mapping
@@ -94,7 +94,7 @@ class PositionLoop:
     Raises
     ------
     DesignError
-        If the sampled loop around the flexible arm is unstable.
+        If the sampled loop around the flexible arm is unstable with `MARGIN` times its gains.
     """
 
     def __init__(self, model, period, settings):
@@ -269,8 +269,6 @@ class PositionLoop:
     def _advance(self):
         """Advance the reference to the next period of the drives."""
         velocity = self.reference_velocity
-        if self._passes:
-            return
         if self._rate is not None:
             velocity[:] = self._rate
             self.reference += self.period * self._rate

@@ -78,7 +78,7 @@ class Simulator:
     friction_warning : str
         States that friction may make a light joint of the simulated arm hunt; empty where it does not.
     stamp_ns : int
-        Its time [ns]: sequence times the period, from `START_NS`.
+        Time of the present sample [ns]: `START_NS` plus sequence times the period.
     position, velocity, torque, strain, amplitude, rate : ndarray
         The present sample: joint position (n,) [rad], velocity (n,) [rad/s], of motors or links as the encoders
         measure them, torque applied until now (n,) [N m], strain (gauges,), modal amplitudes derived from the strains,

@@ -316,6 +316,14 @@ def test_stamps_jitter_within_their_bound_and_alike_with_the_same_seed():
     assert 300_000 < max(np.abs(off[0])) <= 400_000
 
 
+@pytest.mark.parametrize(
+    "fault", ["state jitter by=1e9", "state future by=1e9", "clock jump by=-1e9 at=0"]
+)
+def test_a_stamp_is_one_that_a_message_can_hold(fault):
+    stamps = {m.stamp_ns for m in only([fault] * 4, 200)}
+    assert min(stamps) >= 0 and max(stamps) <= fault_injector.LAST_NS
+
+
 def test_a_session_changes_for_good_and_a_second_source_sends_in_turn():
     injector = FaultInjector(ARM, ["session change at=0.003"])
     assert [m[0].session for m in sent([], 6, injector)] == [0, 0, 0, 1, 1, 1]

@@ -105,7 +105,7 @@ def declared(name, values):
 def chosen(name, values):
     """The chosen component: ``{"type": …, its parameters}``, without parameters of other components of its group.
 
-    Names that belong to no component of the group stay, and the design refuses them.
+    Names that belong to no component of the group are kept, so that the design refuses them.
     """
     given = under(values, name) | {"type": type_of(name, values)}
     own = {p.name for p in declared(name, values)} | {"type"}

@@ -102,7 +102,7 @@ def design(model, slow, fast, manifold=None, settings=None):
         return control
     wanted = chosen["feedforward"]
     kind = None if wanted == "none" else registry.find(FEEDFORWARD, wanted)
-    if slow_law.drifts:  # joints that nothing holds have no pole left of zero
+    if slow_law.drifts:  # joints that no law holds have poles at zero, which the check would refuse
         return control
     q = fast_law.configuration
     full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
@@ -114,7 +114,7 @@ def design(model, slow, fast, manifold=None, settings=None):
     fuller = modes.fuller(0, level != "file", level == FINITE_SLOPE)
     if modes is not model:
         seen += (shown(model, fuller),)
-    # The manifold keeps the file's kinematics: the regulator of the fuller arm follows it, and takes up the rest.
+    # The manifold keeps the file's kinematics: the regulator of the fuller arm follows it and removes the difference.
     known = None if fuller is model else model
     motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q, known))
     together = chosen["saturation"] == "together"

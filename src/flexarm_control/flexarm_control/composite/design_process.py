@@ -67,7 +67,7 @@ class _Unpickler(pickle.Unpickler):
             model = model if more is None else model.fuller(*more)
             model = self._models[scale, more] = model if scale == 1.0 else model.with_payload(scale)
             rest = np.zeros(model.n_joints)
-            # The data that terms are computed from are made here, not on the control path.
+            # Prepare the data for the terms here, not on the control path.
             model.terms(rest, rest)
         return self._models[scale, more]
 

@@ -6,9 +6,9 @@ sample it moves exactly by
 
 .. math:: s_{k+1} = \Phi s_k + \Gamma u_k, \qquad s = (q, \delta, \dot q, \dot\delta) .
 
-The control law is linearised by finite differences of its own `step`, so that its slow law, manifold and fast law are
-included, whatever they are. The states of a fast law that has some, and the torques under way in a delay, are states of
-the loop, too. Poles are given as those of continuous time, s = ln(z) / T.
+The control law is linearised by finite differences of its own `step`, so this works for any slow law and manifold. The
+gain or the states of the fast law, and the torques under way in a delay, are added to the loop. Poles are given as
+those of continuous time, s = ln(z) / T.
 """
 
 import numpy as np
@@ -35,7 +35,7 @@ def linear_law(law, q):
     """
     model = law.model
     n, m = model.n_joints, model.n_modes
-    # The fast law is left out, since its gain is known.
+    # The fast law is left out here, because its gain or compensator is known.
     reference, plain = at_rest(q), type(law)(model, law.slow, NoFastLaw(model, {}), law.manifold)
 
     def response(s):
@@ -71,7 +71,8 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
         Matrix for (s, the fast law's states, torques under way, newest last).
     """
     model = law.model
-    # A law that compensates Coulomb friction takes it as steep as at rest. For another law it is no damping.
+    # A slow law with model terms compensates Coulomb friction with its slope at rest, so the plant has this slope, too.
+    # For a `separate` law the plant has no Coulomb friction, so that friction does not count as damping.
     A, B = linear_plant(plant or model, np.asarray(q, float), not law.slow.separate)
     B = gain * B
     n = B.shape[1]
@@ -109,9 +110,9 @@ def closed_loop(law, q, period, delay=0.0, plant=None, gain=1.0):
 
 
 def poles(law, q, period, delay=0.0, plant=None, gain=1.0):
-    """Poles of the sampled closed loop, given as those of continuous time [1/s], slowest first."""
+    """Poles of the sampled closed loop, converted to continuous time [1/s], slowest first."""
     z = np.linalg.eigvals(closed_loop(law, q, period, delay, plant, gain)).astype(complex)
-    z = z[np.abs(z) > 1e-12]  # dead-beat: a delay's own
+    z = z[np.abs(z) > 1e-12]  # without the dead-beat poles of the delay
     s = np.log(z) / period
     return s[np.lexsort((s.imag, -s.real))]
 

@@ -10,8 +10,8 @@ Two jumps are made to fade (module `fading`):
   it is for another payload, this difference fades within two periods of the lowest mode with locked joints, so that the
   arm does not ring; if the reference also rests, the slow law's integral first takes as much of it as it can.
 - Without a feed-forward, slow torque and manifold jump where the reference changes to another polynomial with another
-  jerk and snap. What the previous polynomial, continued, would give more is added. A feed-forward does this in its own
-  motion.
+  jerk and snap. The jump is the value for the previous polynomial, continued to this sample, minus the value for the
+  new one. A feed-forward lets jumps fade in its own motion.
 """
 
 import numpy as np
@@ -38,7 +38,7 @@ class CompositeControl:
     slow : SlowLaw
     fast : FastLaw
     manifold : Manifold, optional
-        If not given, the paper's, `QuasiSteady`.
+        If not given, that of the paper, `QuasiSteady`.
     feedforward : Feedforward, optional
         The motion that the arm is held to; if not given, the reference and its manifold.
     seen : tuple
@@ -179,11 +179,11 @@ class CompositeControl:
         return self.torque
 
     def _within_limit(self, u_slow, u_fast):
-        """Scale the feedback of all joints so that no torque is beyond its limit; return what `SlowLaw.saw` is to see.
+        """Scale the feedback of all joints so that no torque is beyond its limit; return the torque for `SlowLaw.saw`.
 
         Gains that couple all joints are designed for the direction of their torque. If one joint alone were clipped,
-        the others might drive the arm on. Meanwhile all integrals wait: with all gains reduced, a loop may be stable
-        only without them.
+        the others might drive the arm on. Meanwhile no integral grows in the direction of its joint's torque: with all
+        gains reduced, a loop may be stable only without integrals.
         """
         scaled = kernels.compiled().together(
             self.feedforward.torque, self._limit, u_slow, u_fast, self.torque, self._wanted
@@ -191,12 +191,12 @@ class CompositeControl:
         return self._wanted if scaled else self.torque
 
     def _goes_over(self, before, sample):
-        """Whether torque of a replaced control is left at this `sample`; `before` is that control, or None."""
+        """Whether torque of a replaced control still fades at this `sample`; `before` is that control, or None."""
         fading = self._exchanged
         fading.advance(sample[-1])
         if before is not None and sample[-1] > 0.0:
             old = before.step(*sample).copy()
-            clip(old, -self._limit, self._limit)  # as it was sent
+            clip(old, -self._limit, self._limit)  # as the old control's torque is sent
             old -= self.torque
             if self._other_payload and not sample[4].velocity.any():
                 taken = self.slow.absorb(old)
@@ -219,7 +219,7 @@ class CompositeControl:
 
     def _slow_on_manifold(self, q, qd, reference, dt):
         """Slow torque towards the reference, including the manifold's torque, and the manifold's z_bar."""
-        terms = self.slow.model.terms(q, qd)  # as the slow law believes the arm to be
+        terms = self.slow.model.terms(q, qd)  # of the arm as the slow law estimates it
         fading, source = self._pieces, self._source
         fading.advance(dt)
         path, stamp_ns = getattr(reference, "path", None), getattr(reference, "stamp_ns", 0)
@@ -283,7 +283,7 @@ class CompositeControl:
         return z_f
 
     def look_ahead(self):
-        """Compute ahead what the next sample needs and what does not depend on it; call once the torque is sent.
+        """Compute ahead what the next step needs but does not depend on its sample; call once the torque is sent.
 
         The reference at the next stamp is known if the time to the next sample equals the time since the last one.
         Otherwise, or without this call, the next step does the work itself, with the same result to the last bit.

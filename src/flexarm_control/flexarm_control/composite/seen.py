@@ -7,8 +7,8 @@ deflections pass the same filter, sample by sample (module `observers.filtered_d
 motion, both are equal, and no error is left.
 
 As in the observer, the filter acts on the positions at the samples, not on the speeds. A torque that is held over a
-sample makes light hubs and fast modes swing within it, so the mean of the speeds at both ends is not the mean speed.
-With that mean, an arm on its motion was pushed off by 5 degrees.
+sample makes light hubs and fast modes swing within the sample. So the mean of the speeds at both ends of the sample is
+not the mean speed. With the mean of both ends, the control pushed an arm off its motion by 5 degrees.
 
 A feed-forward may know more modes than the observer (`feedforward_modes`). The gauges, with their rows R (module
 `flexarm_dynamics.arm.strain_map`), would then show its amplitudes :math:`\delta'` as

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Fast control with a given gain: u_fast = K_f z_f with K_f from a parameter, and a low-pass filter.
 
-The gain itself is the result of a design, by `flexarm design` or by a method of your own. There may be several sets of
-gains, each made for its own configuration (`flexarm_control.schedule`).
+The gain comes from `flexarm design` or from a method of your own. There may be several sets of gains, each designed for
+its own configuration (`flexarm_control.schedule`).
 """
 
 import numpy as np

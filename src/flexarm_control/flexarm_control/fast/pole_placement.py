@@ -153,7 +153,7 @@ def moving_gain(A, B, pair, polynomial):
         rows = left[[real[np.argmin(np.abs(poles[real] - p))] for p in pair]].real
         rows /= np.linalg.norm(rows @ B, axis=1)[:, None]
         first, second = rows @ B
-        # A direction between the two reaches both. If they are orthogonal, a singular vector would miss one of them.
+        # A direction between the two reaches both. If they are orthogonal, a singular vector may miss one of them.
         direction = first + (second if first @ second >= 0.0 else -second)
         direction /= np.linalg.norm(direction)
     block = rows @ A @ np.linalg.pinv(rows)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Optimal fast control with a gain scheduled over the workspace: that of `lqr`, as (11) changes with q.
 
-Siciliano & Book (1986) solve (20) once, in the trajectory's end configuration. Here it is solved on a regular grid of
+Siciliano & Book (1986) solve (20) once, at the end of the trajectory. Here it is solved on a regular grid of
 joint configurations. The control path interpolates the gain multilinearly between them:
 
 .. math::

@@ -15,7 +15,7 @@ class Settings:
 
     period: float  # of the samples [s]
     configuration: np.ndarray  # of the joints, (n,) [rad]
-    known: object = None  # the control's own `ArmModel`, where the feed-forward knows more
+    known: object = None  # the control's own `ArmModel`, if the feed-forward's model has more
 
 
 class Feedforward(Component, ABC):

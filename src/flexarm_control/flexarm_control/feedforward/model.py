@@ -2,8 +2,8 @@
 r"""Feed-forward from a model that runs in parallel: the nominal arm, simulated under its own regulator.
 
 The slow manifold along the reference, :math:`s_{ref} = (q_{ref}, \bar\delta, \dot q_{ref}, \dot{\bar\delta})` with
-its torque u_ref, is not quite a motion of the arm: its expansion in mu is truncated, and the rates of the deflections
-jump wherever the reference's jerk does. A fast control that pulls the real arm over such a jump kicks the joints, and
+its torque u_ref, is not exactly a motion of the arm: its expansion in mu is truncated, and the rates of the deflections
+jump wherever the reference's jerk jumps. A fast control that pulls the real arm over such a jump kicks the joints, and
 they return no faster than the slow poles. Therefore the nominal arm is simulated here, with the control model, under
 
 .. math:: u_s = u_{ref} + K_s\,(s_{ref} - s),
@@ -24,17 +24,17 @@ interpolated. They are designed about the moving arm (`moving_plant`), because a
 differently from one at rest; for a stop on the way also about the arm at rest. A trajectory that arrives while such an
 arm moves is followed on the slow manifold alone.
 
-Coulomb friction would hold the simulated arm beside the reference, where no integral moves it on. So the friction on
-the reference, which is part of u_ref, is replaced by the friction at the simulated arm's own speeds, sample by sample.
-Friction takes just that from the torque, and the arm moves as if it had none.
+Coulomb friction would hold the simulated arm beside the reference, because the regulator has no integral. So the
+friction on the reference, which is part of u_ref, is replaced in each sample by the friction at the simulated arm's own
+speeds. The simulated friction cancels exactly this part of the torque, and the arm moves as if it had no friction.
 
 At rest, s_ref and u_ref are those at which the control model rests under its own weight. The manifold neglects products
 of deflections and weight; on it, the simulated arm would hang beside the reference.
 
-The manifold jumps wherever the reference's jerk or snap does: between the polynomials of a trajectory, at its start and
-end. The regulator's torque must not jump. So the jump is added to what the regulator tracks, and fades (module
-`fading`). J_i is the value of the polynomial before t_i, continued to t_i, minus that of the one after it; likewise for
-u_ref.
+The manifold jumps wherever the reference's jerk or snap jumps: between the polynomials of a trajectory, and at its
+start and end. The regulator's torque must not jump. So the jump is added to what the regulator tracks, and fades
+(module `fading`). J_i is s_ref of the polynomial before t_i, continued to t_i, minus s_ref of the polynomial after it;
+likewise for u_ref.
 """
 
 from dataclasses import dataclass, replace
@@ -73,7 +73,7 @@ NEGLIGIBLE = 1e-6
 #: Number of times between two designs at which the interpolated gain is checked. If it does not hold the arm, the
 #: interval is halved, as long as a joint turns by more than this in it [rad].
 CHECKS, NEAREST = 3, APART / 8.0
-#: Parts of a preparation, each useful without the next.
+#: Parts of a preparation, in this order; each part is useful without the later ones.
 RESTING, MOVING, PLAN = "regulators of the arm at rest", "regulators of the moving arm", "plan"
 PARTS = RESTING, MOVING, PLAN
 #: When the reference rests, and every coordinate is this close to it, the simulated arm is set to the reference.
@@ -85,9 +85,9 @@ SAME_START = 1e-6
 def regulator(model, q, period, velocity=None, acceleration=None):
     """Optimal gain K_s of the whole arm in a configuration, shape (n, 2 (n + m)); see the module.
 
-    With a `velocity` and an `acceleration` (n,) of its joints the arm moves; without, it rests. The gain is that of
-    continuous time. If the torque is held for a `period` [s] that is too long for it, as with modes near the sampling
-    frequency, the gain is the optimal one of sampled time.
+    With a `velocity` and an `acceleration` (n,) of its joints the arm moves; without, it rests. The gain is optimal in
+    continuous time. If this gain is unstable with a torque that is held for a `period` [s], as with modes near the
+    sampling frequency, the gain is the one that is optimal in sampled time.
     """
     n, omega = model.n_joints, lowest(model, q)
     A, B = _plant(model, q, velocity, acceleration)
@@ -124,8 +124,8 @@ def reached(A, B):
     """Orthonormal directions of the state without the modes that no torque reaches, shape (N, k).
 
     The left eigenvectors W of those modes, :math:`W A = T W` with :math:`W B = 0`, give coordinates that move by
-    themselves, whatever the torque is. V spans the rest, :math:`W V = 0`. A gain K of (V'AV, V'B) gives A - B K V' the
-    poles of T and of V'AV - V'B K.
+    themselves, whatever the torque is. V spans the remaining directions, :math:`W V = 0`. A gain K of (V'AV, V'B) gives
+    A - B K V' the poles of T and of V'AV - V'B K.
     """
     poles, vectors = np.linalg.eig(A.T)
     bending = np.flatnonzero(poles.imag > 0.0)
@@ -162,7 +162,7 @@ class Preparation:
 
     start: np.ndarray  # state of the reference that it begins from, (3, n)
     gains: Gains | None
-    at_rest: Gains | None = None  # for a stop on the way
+    at_rest: Gains | None = None  # of the arm at rest on the path, for a stop on the way
     plan: object = None  # a `preview.Plan`
     trajectory_id: int = 0  # 0 until it is accepted
     note: str = ""  # what is missing, and why
@@ -423,14 +423,14 @@ class ModelFeedforward(Feedforward):
                 found.note = "; ".join(filter(None, (found.note, found.plan and found.plan.note)))
             elif self.K is None:
                 found.gains = gains_along(model, path, self.settings.period, part == MOVING)
-                if found.at_rest is None:  # in a stop, those of the moving arm are better than none
+                if found.at_rest is None:  # in a stop, gains of the moving arm are better than none
                     found.at_rest = found.gains
         except DesignError as error:  # the parts so far are better than nothing
             found.note = "; ".join(filter(None, (found.note, str(error))))
         return found
 
     def _plan(self, model, path, start):
-        """A `Plan` that is followed in place of the slow manifold, if any; a `DesignError` where there is none."""
+        """A `Plan` that is followed in place of the slow manifold, or None; a `DesignError` if none is found."""
 
     def take(self, plan, trajectory_id):
         if plan is not None:
@@ -447,7 +447,7 @@ class ModelFeedforward(Feedforward):
             before = other._run.source
             if self._other_payload(other) and before is not None and before.rests:
                 self._first = (
-                    True  # bent by its own weight at once; `law` lets the change of torque fade
+                    True  # starts bent by the new weight; `law` lets the change of torque fade
                 )
             else:
                 self._run.take(other._run)
@@ -544,7 +544,7 @@ class ModelFeedforward(Feedforward):
         if self._first or before is None:
             fading.clear()
             if not (source.rests or some(reference.velocity) or reference.acceleration.any()):
-                # A motion's first instant: the arm still rests, and the manifold has jumped.
+                # The first instant of a motion: the arm still rests, but the manifold has jumped.
                 rest = np.concatenate(self._at_rest(reference.position))
                 fading.jump(rest - np.concatenate([source.state, source.torque]))
         else:
@@ -552,7 +552,7 @@ class ModelFeedforward(Feedforward):
             if not source.goes_on(before):
                 now = np.concatenate([source.state, source.torque])
                 fading.jump(self._continued(before, dt) - now)
-        if K is None and run.gained:  # the error that the regulator had left is a jump, too
+        if K is None and run.gained:  # the regulator ends: its remaining error is a jump, too
             wanted = np.concatenate([source.state, source.torque]) + fading.left
             fading.jump(np.concatenate([run.state, run.torque]) - wanted)
         run.source, run.gained = source, K is not None
@@ -560,7 +560,7 @@ class ModelFeedforward(Feedforward):
         # The largest error of the joints, and of all coordinates.
         joints, largest = compiled.off(source.state, left, run.state, error)
         first, self._first = self._first, False
-        run.placed = first or not joints < LOST  # NaN is lost, too
+        run.placed = first or not joints < LOST  # also true for NaN
         if run.placed or K is None or (largest < THERE and not some(reference.velocity)):
             run.state += error
             error[:] = 0.0

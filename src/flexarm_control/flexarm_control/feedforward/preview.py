@@ -15,12 +15,12 @@ are linear in c to first order. The shift with the least mean square,
     \delta(T) = \bar\delta,\; \dot\delta(T) = 0,
 
 solves one linear system. If its torque exceeds the limit, the torque beyond 0.95 of it is penalised where it occurs,
-round by round. (The shift with the smallest maximum within the limit, a linear programme, ends sooner, but turns
-steeply from bound to bound. What this excites beside the plan was lost on one random arm.) The full equations are then
-integrated along the solution, and the remaining bending at the end is solved for again. This uses the same derivatives
-as long as they make the next change much smaller. A mode that the shift does not move is left out. All of this happens
-when the trajectory is received, off the control path. `model` follows the motion in place of the slow manifold: the
-regulator of its simulated arm removes the remaining error.
+round by round. (A linear programme finds the shift with the smallest maximum within the limit. It takes less time, but
+this shift turns steeply from bound to bound and excites modes beside the plan; one random arm was lost with it.) The
+full equations are then integrated along the solution, and the next round removes the bending that remains at the end.
+It uses the same derivatives as long as each change is much smaller than the one before it. A mode that the shift does
+not move is left out. All of this happens when the trajectory is received, off the control path. `model` follows the
+motion in place of the slow manifold: the regulator of its simulated arm removes the remaining error.
 
 If no shift is found within the torque limit, and the feed-forward knows more of the arm than the control, the plan of
 the control's own model is taken. If that has none either, the motion that `model` makes with that model is taken. If
@@ -65,28 +65,29 @@ FASTEST = 3.0
 #: linearised again if a change is more than this fraction of the one before it.
 ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
 #: A plan is not found if its last change was more than this [rad]. The search for it ends early if, after this many
-#: rounds, the change is also still more than `SLOW` of the first one. The regulator takes up what a smaller one leaves.
+#: rounds, the change is also still more than `SLOW` of the first one. If the last change was smaller, the regulator
+#: removes the remaining error.
 FOUND, HOPELESS = 0.02, 5
-#: Fraction of the torque limit that a plan aims at where it would take more, weight of the penalty beyond it, and
-#: maximum number of rounds with a penalty.
+#: Fraction of the torque limit at which a plan aims where its torque would be higher, weight of the penalty on torque
+#: beyond it, and maximum number of rounds with a penalty.
 RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
-#: Number of times at which shift and torque are bounded.
+#: Approximate number of times at which the torque is bounded.
 GRID = 100
-#: Number of times at which the equations are linearised, at first and again, and the step of the finite differences
-#: [rad], [rad/s]. If the first number is used throughout, the rounds hardly converge where the torque limit is active:
-#: two random arms seemed to have no plan.
+#: Number of times at which the equations are linearised, in the first round and later, and the step of the finite
+#: differences [rad], [rad/s]. With the first number throughout, the rounds hardly converge where the torque limit is
+#: active: for two random arms no plan was found.
 KNOTS, SMALL = (80, 400), 1e-6
 #: Weight of the shift's acceleration, over the square of the lowest bending frequency, relative to the shift.
 SMOOTHNESS = 0.01
-#: Phase of the fastest mode per step at which the fourth-order Runge-Kutta method is still stable, with a margin; and a
-#: smaller phase for motions that make that mode faster, so that the first would be too large [rad].
+#: Phase of the fastest mode per step at which the fourth-order Runge-Kutta method is stable, with a margin. The second,
+#: smaller phase is for motions that make this mode so fast that the first is too large [rad].
 STABLE, STABLER = 1.5, 0.75
 #: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
 #: A mode is left as it is if the shift's force on it is less than this fraction of that on others [-]. With finite
 #: slopes, the shift has some force on a mode across the joints' axes.
 UNMOVED = 1e-2
-#: Maximum ratio of the plan's steps to those grid steps [-].
+#: The plan's step is at most this fraction of the step of `STEPS_PER_PERIOD`, or one step of the integration [-].
 PLANNED = 0.25
 #: A motion of more steps is not planned.
 MAX_STEPS = 40_000
@@ -147,7 +148,7 @@ class Preview(ModelFeedforward):
             except DesignError:
                 if known is None:
                     raise
-            # The plan of the control's own model is near one, and within the torque limit; the manifold may not be.
+            # The plan of the control's own model nearly fits, and is within the torque limit; the manifold may not be.
             known = copy(known)
             try:
                 plan = self._solved(known, path, start)
@@ -167,7 +168,7 @@ class Preview(ModelFeedforward):
             return finer.solve()
 
     def _regulated(self, known, path, start):
-        """What `model` makes of a path with the control's own model, as a `Plan` within the torque limit, too."""
+        """The motion of `model` along a path with the control's own model, as a `Plan` within the torque limit."""
         settings, period = replace(self.settings, known=None), self.settings.period
         forward = ModelFeedforward(known, self.manifold.of(known), settings)
         forward.limit = self.limit
@@ -193,7 +194,7 @@ class Preview(ModelFeedforward):
     def _along(self, plan, path, stamp_ns, offset):
         way = path.followed
         elapsed = (stamp_ns - way.start_ns) / SECOND + offset
-        # The torque is held over the coming period, so that of its middle is taken.
+        # The torque is held over the coming period, so the plan's torque in the middle of that period is taken.
         state, torque = plan.state_at(elapsed), plan.torque_at(elapsed + 0.5 * self.settings.period)
         if path is way:
             return state, torque
@@ -216,7 +217,7 @@ def _finite(*arrays):
 
 
 class _Planner:
-    """Plans one trajectory, in steps over which the phase of the fastest mode grows by at most `phase` [rad]."""
+    """Plans one trajectory; the phase of the fastest mode grows by at most `phase` [rad] per step."""
 
     def __init__(self, model, path, start, limit, phase=STABLE):
         self.model, self.start, self.limit = model, start, limit
@@ -239,7 +240,7 @@ class _Planner:
         self.modal = shapes[:, :slow].T @ at_end.M[n:, n:] if m else np.zeros((0, 0))
         step = min(2.0 * np.pi / omega[max(slow, 1) - 1] / STEPS_PER_PERIOD, 0.01)
         self.steps = int(np.ceil(self.duration / min(step, phase / omega[-1])))
-        # The plan has fewer steps if the fastest mode, which is not planned, needs short ones.
+        # The plan has fewer steps than the integration if a faster mode that is not planned needs short ones.
         self.stride = max(1, int(PLANNED * step * self.steps / self.duration))
         self.steps = self.stride * int(np.ceil(self.steps / self.stride))
         if self.steps > MAX_STEPS:
@@ -258,7 +259,7 @@ class _Planner:
             path.evaluate(min(round(t * SECOND), path.duration_ns - 1), self.reference[k])
         knots = np.concatenate([np.zeros(5), knots, np.full(5, self.duration)])
         everything = BSpline(knots, np.eye(knots.size - 6), 5)
-        # Without the first and last three, the shift is zero at either end, with velocity and acceleration.
+        # Without the first and last three, shift, velocity and acceleration are zero at either end.
         self.basis = np.array([everything(self.times, nu)[:, 3:-3] for nu in range(3)])
 
     def solve(self):
@@ -305,7 +306,7 @@ class _Planner:
                 for part, values in zip(bent, self._step(i, x, v), strict=True):
                     states[i + 1, part] = values
             return tuple(states[:, part] for part in bent)
-        # In each step, the straight line with the acceleration's mean, by Simpson's rule, and its first moment.
+        # In each step, the acceleration is a straight line with the same mean, by Simpson's rule, and first moment.
         change = np.diff(q[:, 2], axis=0)
         begin = (q[:-1, 2] + 4.0 * self.motion[1::2, 2] + q[1:, 2]) / 6.0 - 0.5 * change
         for i in range(self.steps):
@@ -348,7 +349,7 @@ class _Planner:
         (found,) = _finite(np.array([self._derivatives(k, x[k // 2], v[k // 2]) for k in at]))
         flat = make_interp_spline(self.times[at], found.reshape(len(at), -1), 1)(self.times)
         everywhere = flat.reshape(-1, m + n, 3 * n + 3 * m)
-        # Columns: q, qd, qdd, x, v, and the bending's own acceleration, which only the torque has.
+        # Columns: q, qd, qdd, x, v, and the bending's own acceleration, on which only the torque depends.
         columns = np.cumsum([n, n, n, m, m])
         a, u = everywhere[:, :m], everywhere[:, m:]
         self.by_joints, self.spring, self.damper, _ = np.split(a, columns[2:], axis=2)
@@ -368,7 +369,7 @@ class _Planner:
                 there = self.model.inverse_dynamics(q, qd, qdd, x, v, a)
                 values[j] = kept
                 out[:, first + j] = (there - here) / SMALL
-        # The bending accelerates so that its forces stay zero; the torque for this comes through M12.
+        # The bending accelerates so that the modal rows of (2) stay zero; M12 adds the torque for this.
         return np.vstack([-np.linalg.solve(M[n:, n:], out[n:]), out[:n]])
 
     def _bending(self, q, qd, qdd, x, v):
@@ -407,7 +408,7 @@ class _Planner:
             (self.torque_by,) = _finite(self._torque(forced, at))
             self.bends = np.vstack([self.modal @ forced[-1, 0], self.modal @ forced[-1, 1]])
         A, b = self.bends, -np.concatenate([self.modal @ (x[-1] - self.rest), self.modal @ v[-1]])
-        # All rows get the same scale, since deflections are thousandths. A mode that no joint moves is left as it is.
+        # All rows are scaled alike, since deflections are thousandths. A mode that no joint moves is left as it is.
         largest = np.abs(A).max(axis=1)
         each = largest.reshape(2, -1) * [self.planned**2, self.planned]  # scaled as forces
         moved = np.tile((each > UNMOVED * each.max(axis=1)[:, None]).all(axis=0), 2)
@@ -429,7 +430,7 @@ class _Planner:
             )
 
     def _within_limits(self, c, A, b, u, du):
-        """As `_least_squares`, within the torque limit if such a solution is found.
+        """As `_least_squares`, but within the torque limit if such a solution is found.
 
         Torque beyond `RESERVED` of the limit is penalised at the times and joints where it occurs, until these no
         longer change.
@@ -451,7 +452,7 @@ class _Planner:
         return change
 
     def _least_squares(self, c, A, b, rows=None, values=None):
-        """The change x with A x = b after which the mean square of the shift, and of its acceleration, is least.
+        """The change x with A x = b after which the weighted mean square of shift and acceleration is smallest.
 
         A penalty of weight `PENALTY` brings `rows` x near `values`.
         """

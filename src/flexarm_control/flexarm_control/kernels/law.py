@@ -38,7 +38,7 @@ def about_motion(q, qd, position, velocity, torque, nominal, response, amplitude
 
 
 def wanted_acceleration(q, qd, position, velocity, acceleration, Lambda0, Lambda1, out):
-    """Fill `out` with v of (13) and (14): what the slow subsystem is to have; all (n,)."""
+    """Fill `out` with v of (13) and (14): the desired acceleration of the slow subsystem; all (n,)."""
     for i in range(q.size):
         pull = Lambda0[i] * (q[i] - position[i]) + Lambda1[i] * (qd[i] - velocity[i])
         out[i] = acceleration[i] + pull
@@ -54,16 +54,16 @@ def deviation(delta, delta_d, delta_bar, rate_bar, quasi_steady, z_f):
 
 
 def together(motion, limit, slow, fast, torque, wanted):
-    """Scale what is fed back of all joints until no torque is beyond its limit; whether one was.
+    """Scale the feedback of all joints until no torque is beyond its limit; return whether one was.
 
     Parameters
     ----------
     motion, limit : ndarray, shape (n,)
-        What is not fed back of the torque, and the largest torques [N m].
+        The motion's torque, which is not scaled, and the torque limits [N m].
     slow, fast, torque : ndarray, shape (n,)
-        Their sum; all are overwritten.
+        Slow and fast torque, and their sum; all are overwritten.
     wanted : ndarray, shape (n,)
-        Filled with the torque's signs times infinity, where one was beyond its limit.
+        If a torque was beyond its limit, filled with the signs of all torques times infinity.
     """
     part, beyond = 1.0, False
     for i in range(torque.size):
@@ -145,7 +145,7 @@ def faded(c, rate, dt):
 
 
 def off(state, left, own, error):
-    """Fill `error`, (N,), with what a simulated arm's state lacks to the one wanted, its fading jump included.
+    """Fill `error`, (N,), with the wanted state, its fading jump included, minus the simulated arm's state.
 
     Parameters
     ----------
@@ -158,9 +158,9 @@ def off(state, left, own, error):
     Returns
     -------
     float
-        Largest magnitude of the joints', the first n; NaN if one is.
+        Largest magnitude of the first n errors, those of the joints; NaN if any error is NaN.
     float
-        Of all.
+        Largest magnitude of all errors; NaN likewise.
     """
     n, joints, largest = left.size - state.size, 0.0, 0.0
     for i in range(state.size):
@@ -175,10 +175,10 @@ def off(state, left, own, error):
 
 
 def regulated(torque, left, gain, error, limit, friction, wanted, own, out, driven):
-    """Fill `out`, (n,), with the torque for a simulated arm; and `driven`, (n,), with what friction leaves of it.
+    """Fill `out`, (n,), with the torque for a simulated arm, and `driven`, (n,), with this torque minus friction.
 
-    A torque, its fading jump, the regulator's, and what the Coulomb friction of the arm's own speeds differs by from
-    that of the wanted ones, all clipped to the limit; see `off`.
+    The torque is the sum of the reference's torque, its fading jump, the regulator's torque, and the Coulomb friction
+    at the arm's own speeds minus that at the wanted speeds. The sum is clipped to the limit; see `off`.
 
     Parameters
     ----------

@@ -5,20 +5,20 @@ import numpy as np
 
 
 def sent(u, weight, part, rate, dt, limit, torque):
-    """Put what may be sent of a torque into `torque`; whether a limit was met.
+    """Put the part of a torque that may be sent into `torque`; return whether a limit was met.
 
     Parameters
     ----------
     u, weight : ndarray, shape (n,)
-        The law's torque, and what holds the arm's weight [N m].
+        The law's torque, and the torque that holds the arm's weight [N m].
     part : float
-        How much of u is there, 0 to 1.
+        Fraction of u - weight that is applied, 0 to 1.
     rate, limit : ndarray, shape (n,)
-        Largest change per second, and size; infinite where there is none [N m/s], [N m].
+        Limits of the torque's change per second and of its size; infinite where there is none [N m/s], [N m].
     dt : float
-        In which the rate counts [s].
+        Time over which the rate limit applies [s].
     torque : ndarray, shape (n,)
-        That one; overwritten.
+        The last torque that was sent; overwritten with the new one [N m].
     """
     met = False
     for i in range(u.size):
@@ -36,7 +36,7 @@ def sent(u, weight, part, rate, dt, limit, torque):
 
 
 def watched(error, q, qd, amplitude, ranges, rows, inverse, value, ratio):
-    """Fill what the supervisor watches, and its ratio to the limits; whether one is above 1, or NaN.
+    """Fill the values that the supervisor watches, and their ratios to the limits; whether a ratio is above 1, or NaN.
 
     Parameters
     ----------
@@ -44,11 +44,11 @@ def watched(error, q, qd, amplitude, ranges, rows, inverse, value, ratio):
         Tracking error, positions and velocities of the joints.
     amplitude : ndarray, shape (m,)
     ranges : ndarray, shape (n or 0, 4)
-        Least and largest position, deceleration, and how far out of range what only will be may count.
+        Least and largest position, deceleration, and the most that a predicted excess of the range may count.
     rows : ndarray, shape (g, m)
         Of the strain map.
     inverse : ndarray, shape (3 n + m + g + 1,)
-        Of the limits.
+        One over each limit.
     value, ratio : ndarray, shape (3 n + m + g + 1,)
         The last value is given, the others are filled.
     """
@@ -58,7 +58,7 @@ def watched(error, q, qd, amplitude, ranges, rows, inverse, value, ratio):
     for i in range(ranges.shape[0]):
         low, high, able, most = ranges[i, 0], ranges[i, 1], ranges[i, 2], ranges[i, 3]
         reach = q[i] + qd[i] * abs(qd[i]) / (2.0 * able)
-        # What only will be is reason to stop, not yet a fault.
+        # A predicted excess is a reason to stop, but not yet a fault.
         will_be = min(max(low - reach, reach - high), most)
         value[2 * n + i] = max(0.0, max(low - q[i], max(q[i] - high, will_be)))
     for i in range(m):
@@ -77,7 +77,7 @@ def watched(error, q, qd, amplitude, ranges, rows, inverse, value, ratio):
 
 
 def alike(a, b, tolerance):
-    """Whether two arrays differ nowhere by more than a tolerance; not where one has NaN."""
+    """Whether two arrays differ nowhere by more than a tolerance; False if one has NaN."""
     near = True
     for i in range(a.size):
         near &= abs(a[i] - b[i]) <= tolerance[i]

@@ -22,7 +22,7 @@ BLOCK = 64
 
 
 def asked(s, fraction, omega_1, omega_c, zeta):
-    """d of a pole [1/s], of a loop of which a fraction is asked; see `robust.decay`."""
+    """d of a pole [1/s]: the decay that is asked of it, in a loop with a `fraction`; see `robust.decay`."""
     if s.real >= 0.0:
         return omega_1
     size = max(abs(s), 1e-12)

@@ -5,7 +5,7 @@ import numpy as np
 
 #: Rows of what `jumps` keeps of each reading; the last one is the reading as it came.
 LINE, RESIDUAL, BOUND, FLOOR, NOISE, SCALE, SQUARE, EXCESS, CAME = 0, 1, 2, 3, 4, 5, 6, 7, 8
-#: Rows of its counts: samples in a row that were replaced, and samples in which none is.
+#: Rows of its counts: samples in a row that were replaced, and coming samples in which it is not replaced.
 RUN, GRACE = 0, 1
 #: Rows of the torque: the last sample's and its change, those of the sample that is judged.
 LAST, CHANGE, NEW, NEW_CHANGE = 0, 1, 2, 3
@@ -93,8 +93,8 @@ def gather(position, strain, amplitude, velocity, rate, value, raw):
 def arrive(value, torque, strength, rows, torques):
     """Note readings as they came, `value` (N,), in `rows`, and the torque in the last two rows of `torques`, (4, n).
 
-    Zeros and NaN mean that the torque is unknown; its change is `strength`, (n,), then [N m]. A change goes on for a
-    while: 0.7 of it in the next sample.
+    Zeros and NaN mean that the torque is unknown; its change is `strength`, (n,), then [N m]. A change is at least 0.7
+    times that of the sample before, because a change acts for several samples.
     """
     for i in range(value.size):
         rows[CAME, i] = value[i]
@@ -124,7 +124,7 @@ def judge_jumps(
     past, times : ndarray, shape (p, N), (p,)
         The last samples.
     first : int
-        The slope is from this one of them to the last.
+        Index of the sample from which the slope to the last one is taken.
     steps : tuple of float
         Time since the last sample [s], and how much of the torque of lost samples may still act.
     late : float
@@ -180,9 +180,9 @@ def learn_jumps(rows, replaced, counts, often, spread, learns, weight, keep, fad
         Readings that were replaced of late.
     spread : float
     learns : bool
-        Whether all is taken for noise.
+        Whether the whole residual counts as noise.
     weight, keep, fade : float
-        Of a new square, of an old excess, and of a reading that was replaced.
+        Weight of a new square, and factors per sample on the old excess and on `often`.
     """
     for i in range(replaced.size):
         residual, noise = rows[RESIDUAL, i], rows[NOISE, i]
@@ -264,8 +264,8 @@ def agree(
         Step of the torque [N m].
     gain : ndarray, shape (k, n)
     factors : tuple of float
-        Ratio by which a rate may be wrong, what multiplies that which the rule can miss, delay of a filtered rate [s],
-        and samples from which on that ratio counts: before, only an opposite sign does.
+        Ratio by which a rate may be wrong, factor on what the trapezoidal rule can miss, delay of a filtered rate [s],
+        and samples of a window from which on that ratio counts: before, only an opposite sign is found.
     noise : ndarray, shape (2, k)
         Of the difference, and of the rates.
     lengths : tuple of int
@@ -278,7 +278,7 @@ def agree(
     run : ndarray of int, shape (k,)
         Samples in a row that each pair has been beyond its bound.
     evidence : ndarray, shape (2, w, k)
-        Change of the value and what the rate gives, when a pair is beyond its bound.
+        Change of the value, and the change that the rate gives; filled when a pair is beyond its bound.
 
     Returns
     -------
@@ -323,7 +323,7 @@ def agree(
 
 
 def renew(value, pairs, lengths, rate, windows, ages):
-    """Begin windows anew that are full, and those of a rate that comes again: they began with NaN."""
+    """Restart windows that are full, and all windows of a pair whose sums are NaN, as its rate was unknown."""
     for j in range(pairs.shape[1]):
         if windows[DRIVEN, 0, j] != windows[DRIVEN, 0, j]:
             for w in range(len(lengths)):
@@ -337,7 +337,7 @@ def renew(value, pairs, lengths, rate, windows, ages):
 
 
 def changed(readings, last, middle, half, same):
-    """Fill the changes since the last readings, which these replace, and which readings stand still.
+    """Fill `last` with these readings and their changes since the last ones, and `same` with those that stand still.
 
     Parameters
     ----------
@@ -400,7 +400,7 @@ def follow_joints(
     inertia : ndarray, shape (n, n)
         Inverse of the joints' mass matrix.
     rows : ndarray, shape (3, n)
-        Torques of the weight, of bent links without deflection, and of what noise of the amplitudes makes [N m].
+        Torque of the weight, that of the links at zero amplitudes, and that due to noise of the amplitudes [N m].
     bent : ndarray, shape (n, m)
         Torque of the bent links per amplitude.
     friction : tuple of ndarray and float
@@ -438,7 +438,7 @@ def follow_joints(
         for j in range(n):
             wanted += inertia[i, j] * net[j]
             doubt += abs(inertia[i, j]) * unsure[j]
-        left = max(abs(wanted) - doubt, 0.0) if acts else 0.0  # nothing acts, or brakes do
+        left = max(abs(wanted) - doubt, 0.0) if acts else 0.0  # else: no torque, or brakes
         if still[i] <= 1:
             moved[0, i] = moved[1, i] = 0.0
         moved[0, i] += dt * (left if wanted > 0.0 else -left)
@@ -457,20 +457,21 @@ def stopped(readings, still, smallest, changes, at, tiny, gauges, limits, found)
         Joint positions, strains, joint velocities.
     still, smallest, tiny : ndarray, shape (N,)
     changes : ndarray, shape (k, N)
-        Before each reading became still; a ring.
+        Changes before each reading began to stand still; a ring buffer.
     at : int
         Where the ring's next change goes.
     gauges : ndarray, shape (3, g)
-        Noise that was seen, noise that is stated, and how many equal readings that rules out.
+        Noise that was seen, noise that is stated, and how many equal readings the latter rules out.
     limits : tuple of int and float
-        Samples that count when the last two changes are large, too, else twice as many do; the ratio of changes.
+        Equal samples that count if one of the last two changes before them is large, otherwise twice as many are
+        needed; ratio of a large change to the smallest one.
     found : ndarray of bool, shape (N,)
-        Filled with those of the gauges and velocities.
+        Filled with the gauges and velocities that stand still.
 
     Returns
     -------
     bool
-        Whether positions and gauges do, all of them, and one of them did at once.
+        Whether all positions and gauges stand still, and at least one of them stopped abruptly.
     """
     g, (least, times) = gauges.shape[1], limits
     n = (readings.size - g) // 2
@@ -498,7 +499,7 @@ def stopped(readings, still, smallest, changes, at, tiny, gauges, limits, found)
 
 
 def all_well(strain, low, high, last, same, seen):
-    """Whether all readings are within their ranges, and none is that before it; all that is kept follows them then.
+    """Whether all readings are in range and differ from the last ones; if so, `last`, `same` and `seen` are updated.
 
     Parameters
     ----------

@@ -32,15 +32,15 @@ def steps(A, pushes, X):
 def limited_steps(A, sent, effect, integral, held, pushes, motion, limit, X):
     r"""Fill X with the states that follow its first one under torque limits, see `robust.recovery`.
 
-    After one that is larger than 1e12 they are NaN.
+    From the first state that is larger than 1e12 on, they are NaN.
 
     Parameters
     ----------
     A : ndarray, shape (N, N)
     sent : ndarray, shape (n, N)
-        Torque that is fed back of a state, beside what is `held`.
+        Matrix of the torque that is fed back from a state, without `held`.
     effect : ndarray, shape (N, n)
-        Of a change of that torque on the next state.
+        Effect of a change of that torque on the next state.
     integral : ndarray of int, shape (n,)
         Which states are the joints' :math:`-w`.
     held : ndarray, shape (n,)

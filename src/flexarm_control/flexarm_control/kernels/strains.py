@@ -43,11 +43,11 @@ def source_amplitudes(value, g, project, rows, middle, half, weights, low, zero,
     zero : ndarray, shape (2 g,)
         Followed while it is learnt.
     state : ndarray, shape (3,)
-        `DIFFERENCE` of amplitudes and strains, largest over the gauges; how `LARGE` and how `FAST` the strains are of
-        late.
+        `DIFFERENCE` of amplitudes and strains, largest over the gauges; how `LARGE` and how `FAST` the strains were
+        recently.
     ways : tuple of int, float, float and bool
-        Samples before this one, corner of the low pass [rad/s], what a sample leaves of the last two, and whether the
-        zero is learnt.
+        Samples before this one, corner of the low pass [rad/s], fraction of `LARGE` and `FAST` that is kept per sample,
+        and whether the zero is learnt.
 
     Returns
     -------
@@ -76,9 +76,9 @@ def source_amplitudes(value, g, project, rows, middle, half, weights, low, zero,
 
 
 def mapped(strain, amplitude, project, rows, middle, half, out):
-    """Fill `out`, (2 g,), with the strains' part that amplitudes explain, and by how much the amplitudes' differ.
+    """Fill `out`, (2 g,), with the strains' part that modes can cause, and the amplitudes' strains minus this part.
 
-    Whether all of it is finite, and no gauge at an end of its range.
+    Returns whether all of it is finite, and no gauge is at an end of its range.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def mapped(strain, amplitude, project, rows, middle, half, out):
 
 
 def apart(rows, zero, corner, large, fast, keep):
-    """Largest difference of `mapped`'s second half to its zero, and how large and fast the first half is of late.
+    """Largest difference of `mapped`'s second half from its zero, and how large and fast its first half was recently.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def apart(rows, zero, corner, large, fast, keep):
     corner : float
         Of the low pass [rad/s].
     large, fast, keep : float
-        Before this sample, and what is left of that.
+        Values before this sample, and the fraction of them that is kept.
     """
     g, difference = zero.size // 2, 0.0
     large, fast = keep * large, keep * fast
@@ -133,7 +133,7 @@ def pick_up(strain, position, middle, half, moments, now):
     position : ndarray, shape (n,)
     moments : int
     now : ndarray, shape (g + n + m + moments g,)
-        The m forces in it stay. All of it stays where a reading is at an end.
+        The m forces in it stay. If a reading is at an end of its range, nothing is written.
     """
     g, n = strain.size, position.size
     for i in range(g):
@@ -150,7 +150,7 @@ def pick_up(strain, position, middle, half, moments, now):
 
 
 def not_explained(low, corner, drive, load, turn, bend, moved, residual):
-    """Fill what the motion does to the strains, and what of them it does not explain.
+    """Fill the accelerations, and the part of the strains that the motion does not explain.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def follow_drift(residual, moved, position, start, drive, load, doubted, rows, w
     rows : ndarray, shape (8, g)
     ways : tuple of int, float, float, bool and float
         Residuals that the zero is the mean of, weights of a residual in its low pass and in the correction, whether the
-        zero is learnt, and the fraction of `LEAST` below which a correction is none.
+        zero is learnt, and the fraction of `LEAST` below which a correction is set to zero.
 
     Returns
     -------
@@ -234,14 +234,14 @@ def follow_drift(residual, moved, position, start, drive, load, doubted, rows, w
 
 
 def noise_of_law(gauge, encoder, square, drive, load, turn, groups):
-    """What noise makes of |z|^2 + |p|^2 in `strain_law`, summed over each gauge's link, shape (g,).
+    """Mean of |z|^2 + |p|^2 in `strain_law` due to noise, summed over each gauge's link, shape (g,).
 
     Parameters
     ----------
     gauge, encoder : ndarray, shape (g,), (n,)
         Variances of low-passed strains and positions.
     square : float
-        Of the corner.
+        Square of the corner.
     drive, load, turn : ndarray, shape (g, n), (g, g), (g, g)
     groups : ndarray of bool, shape (g, g)
     """
@@ -324,7 +324,7 @@ def follow_misfit(fast, project, load, turn, groups, sums, keep, run, noise, lim
     Returns
     -------
     bool
-        Whether one has been large for so long.
+        Whether the misfit of a gauge has been large for that long.
     """
     clear, large, least = limits
     g, long = run.size, False

@@ -9,7 +9,8 @@ deflections have the quasi-steady state :math:`\bar\delta` (9). The deviation :m
 
 with :math:`A_2` along the motion, or at one configuration. It is measured by its energy,
 :math:`E = \frac12\delta_f^T K\delta_f + \frac12\dot\delta_f^T H_{22}^{-1}\dot\delta_f` (joints free), which
-treats metres and radians of all modes alike. There is no fast control here; it would have to remove this energy.
+treats metres and radians of all modes alike. There is no fast control here; a fast control would have to remove this
+energy.
 """
 
 from dataclasses import dataclass
@@ -135,7 +136,7 @@ class FastResponse:
         return out
 
     def weighed(self, deviation):
-        """Deviations (k, 2m, c), weighed such that E is half of their square, (k, 2m, c)."""
+        """Deviations (k, 2m, c), weighted such that E is half of their square, (k, 2m, c)."""
         steps = np.minimum(np.arange(deviation.shape[0]), len(self.root) - 1)
         return self.root[steps] @ deviation
 

@@ -28,7 +28,7 @@ LIMITS = (
     ),
 )
 PARAMETERS = (*excitation_torque.PARAMETERS, *LIMITS)
-#: At rest a joint stays within this [rad], and two encoder counts.
+#: At rest a joint moves by at most this [rad] plus two encoder counts.
 REST = 0.005
 #: Default limit of a gauge's reading, as a fraction of its full scale [-].
 FULL_SCALE_FRACTION = 0.8
@@ -86,7 +86,7 @@ class ExcitationRun:
 
     @property
     def duration(self):
-        """Duration of the excitation [s]; until it begins, as planned for the straight arm."""
+        """Duration of the excitation [s]; until it begins, that for the straight arm."""
         if self._begin is None:
             return ExcitationTorque(self.model, self._shape).duration
         return self._push.duration

@@ -7,9 +7,9 @@ The joints are excited one after the other, with amplitude A and a pause in whic
 - ring_down: :math:`A\sin(2\pi f t)`, some periods at the first bending frequency f with the joints free;
 - sweep: :math:`A\,w(t)\sin 2\pi(f_0 t + (f_1 - f_0)t^2/2T)`, from f_0 to f_1, faded in and out by w.
 
-A torque that holds the arm's weight where it stood is added, and optionally a soft spring and damper about that
-position: :math:`-B^{-1}_{jj}(\omega_h^2\,\Delta q + 1.4\,\omega_h\,\dot q)`. The recorded torque is the sum, which
-is all that a fit needs.
+A torque that holds the arm's weight at its start position is added. A soft spring and damper about that position may be
+added as well (`excitation_run`): :math:`-(\omega_h^2\,\Delta q + 1.4\,\omega_h\,\dot q) / B_{jj}`. The recorded torque
+is the sum, which is all that a fit needs.
 """
 
 from collections.abc import Mapping
@@ -45,7 +45,7 @@ PARAMETERS = (
 )
 #: Fraction of a sweep over which it fades in, and out [-].
 FADE = 0.05
-#: Periods of a ring-down's push.
+#: Periods of the first bending frequency in a ring-down's torque.
 PUSHES = 3
 #: Minimum duration of a sweep [s], and in periods of the slowest mode.
 MIN_SWEEP, SWEEP_PERIODS = 4.0, 12.0
@@ -67,7 +67,7 @@ class ExcitationTorque:
     duration : float
         Duration of the whole torque [s].
     hold : ndarray, shape (n,)
-        Torque that holds the arm's weight [N m].
+        Torque that holds the arm's weight at `position` [N m].
 
     Raises
     ------

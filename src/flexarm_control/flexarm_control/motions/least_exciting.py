@@ -28,7 +28,7 @@ from flexarm_dynamics.errors import DesignError, ShapeError, TrajectoryError
 from . import excitation
 from .profiles import Profile, quintic
 
-#: Pieces of the spline. Points at multiples of T / INTERVALS make the sampled motion exact.
+#: Pieces of the spline. Trajectory points at all multiples of T / INTERVALS make the sampled motion exact.
 INTERVALS = 25
 #: Number of times per piece at which limits are enforced and the response is computed.
 PER_INTERVAL = 6
@@ -36,10 +36,11 @@ _DEGREE = 5
 _REST = 4  # coefficients at either end, fixed by rest without jerk
 #: Weight w of the energy left at the end, relative to the mean along the way.
 RESIDUAL_WEIGHT = 100.0
-#: Weight epsilon of the jerk: of motions that excite alike, it selects the smoother.
+#: Weight epsilon of the jerk: among motions that excite equally, it selects the smoothest.
 JERK_WEIGHT = 1e-4
 _ROUNDS = 40
-#: The fast subsystem is updated in this many rounds only: with it, fast motions would not settle.
+#: The fast subsystem is updated in this many rounds only, the first ones: with updates in all, fast motions would not
+#: settle.
 _REFRESHED = 10
 _ITERATIONS = 100
 _SETTLED = 1e-5  # of sigma, between two rounds
@@ -112,7 +113,7 @@ def _limit(name, given, default):
 
 
 class _Basis:
-    """sigma and its derivatives at the grid's times as functions of the free coefficients: r + A x, by s = t / T."""
+    """sigma and its derivatives by s = t / T at the grid's times, as functions r + A x of the free coefficients."""
 
     def __init__(self):
         inner = np.linspace(0.0, 1.0, INTERVALS + 1)[1:-1]
@@ -252,7 +253,7 @@ class _Problem:
             below, above = above, 1.5 * above
         else:
             return None
-        middle = 0.991 * above  # the guess is often right
+        middle = 0.991 * above  # the first guess is often right
         while above > 1.01 * below:
             if self._least_factor(middle) <= 1.0:
                 above = middle
@@ -303,7 +304,7 @@ class _Problem:
             except TrajectoryError as error:
                 raise self._unsettled(f"round {count}: {error}") from None
             change = np.abs(self.basis.matrices[0] @ (new - x)).max()
-            # A full step while it converges, a part of it where it oscillates.
+            # A full step while the rounds converge, a fraction of it if they oscillate.
             part = max(0.5 * part, 0.1) if change > 0.7 * before else min(1.5 * part, 1.0)
             x, before = x + (part if change > _SETTLED else 1.0) * (new - x), change
             if change > _SETTLED:
@@ -391,7 +392,7 @@ def least_squares(E, f, G, h):
     Q, R = np.linalg.qr(E)
     C = np.linalg.solve(R.T, G.T).T
     scale = np.linalg.norm(C, axis=1)
-    empty = scale <= 1e-12 * scale.max()  # at the ends nothing is free
+    empty = scale <= 1e-12 * scale.max()  # at the ends x has no effect
     if (h[empty] > 1e-9).any():
         raise TrajectoryError("the limits leave no room at the ends", hint="raise one of them")
     C, d = C[~empty] / scale[~empty, None], h[~empty] / scale[~empty]
@@ -407,7 +408,7 @@ def least_squares(E, f, G, h):
         if max(np.abs(dual).max(), np.abs(primal).max(), gap) < 1e-10 * size:
             return np.linalg.solve(R, y)
         if not force.max() < 1e20 * size or slack.min() < 1e-30 * size:
-            break  # forces without bound: nothing satisfies all
+            break  # forces grow without bound: no x satisfies all inequalities
         weight = force / slack
         matrix = np.linalg.cholesky(np.eye(y.size) + (C.T * weight) @ C)
 

@@ -144,11 +144,12 @@ def smooth(start, end, duration, smoothness=3) -> Profile:
     .. math:: \sigma = I_s(k+1, k+1), \qquad
         \sigma' = \frac{s^k (1-s)^k}{B(k+1, k+1)}
 
-    with the beta function B and the regularised incomplete beta function I: the polynomial of degree
-    2 k + 1 that is C^k with rest on both sides, so of least degree. k = 2 is the quintic, k = 3 the
-    septic, and so on, e.g. Biagiotti & Melchiorri (2008), section 2.1.7; this form keeps its digits
-    where the power series of a high k cancels. The more derivatives, the faster the spectrum of the
-    acceleration falls (as omega^-k), and the higher its peaks: the speed's is 1 / (4^k B(k+1, k+1)) of the mean.
+    with the beta function B and the regularised incomplete beta function I: the polynomial of
+    least degree, 2 k + 1, that has k continuous derivatives together with the rest on both sides. k = 2 is the quintic,
+    k = 3 the septic, and so on, e.g. Biagiotti & Melchiorri (2008), section 2.1.7. This form stays accurate for a high
+    k, where the power series suffers from cancellation. The more derivatives, the faster the spectrum of the
+    acceleration falls (as omega^-k), and the higher the peaks: that of the speed is 1 / (4^k B(k+1, k+1)) times the
+    mean speed.
 
     Parameters
     ----------

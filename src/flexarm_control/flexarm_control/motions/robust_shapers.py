@@ -2,15 +2,15 @@
 r"""Finds the shaper that leaves least of several modes with uncertain frequencies, in a given time.
 
 Impulses :math:`A_k \ge 0` at equal spacing over the time allowed, :math:`\sum_k A_k = 1`, are chosen by a linear
-programme, so that the largest residual V of `shapers` over all frequencies within the spread of any mode is least:
+programme. It minimises the largest residual V (module `shapers`) over all frequencies within the spread of any mode:
 
 .. math:: \min_{A,\,\epsilon} \epsilon \quad\text{with}\quad
     \mathrm{Re}\,\bigl(e^{-j\varphi} \sum_k A_k e^{\zeta\omega(t_k - t_n)} e^{j\omega_d t_k}\bigr) \le \epsilon
 
-for frequencies close to each other and for directions :math:`\varphi` around the circle, whose polygon is V to
-1 - cos(pi / `DIRECTIONS`). At each mode's own frequency V is at most :math:`\epsilon` times `AT_DESIGN`. Such minimax
-designs instead of several conditions are due to Singhose, Seering & Singer (1994) for one mode, and as linear
-programmes to Singh (2008), *Minimax input shaper design using linear programming*.
+for closely spaced frequencies and for directions :math:`\varphi` around the circle. The polygon of these directions
+gives V with a relative error of at most 1 - cos(pi / `DIRECTIONS`). At each mode's own frequency V is at most
+:math:`\epsilon` times `AT_DESIGN`. Minimax designs instead of several conditions are due to Singhose, Seering & Singer
+(1994) for one mode, and as linear programmes to Singh (2008), *Minimax input shaper design using linear programming*.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ NEGLIGIBLE = 1e-6
 
 
 def robust(frequencies, dampings, spread, periods) -> Shaper:
-    """Return the shaper of several modes with the least largest residual.
+    """Return the shaper of several modes whose largest residual is smallest.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ Any motion convolved with the train leaves the same fraction of its own vibratio
   proportional to (1, cK, cK^2, K^3), :math:`c = 1 + 2\cos\varphi`. Without damping
   :math:`V = |T_3(x_0\cos\frac{\omega T}{4})| / T_3(x_0)`, with T_3 the Chebyshev polynomial and T the design period,
   which gives :math:`x_0 = \cosh(\frac13 \mathrm{arcosh}\frac1V)` and :math:`\cos\varphi = 1 - 3/(2x_0^2)`, that is, the
-  published amplitudes. With damping the humps have that height only nearly.
+  published amplitudes. With damping the humps have only approximately that height.
 
 For several modes the trains are convolved (Singhose, Seering & Singer 1997). The modes are those of the fast
 subsystem (11), whose input is the slow torque of the motion. While mass matrix and configuration do not change,
@@ -160,7 +160,7 @@ def ei(omega, zeta) -> Shaper:
     """Return the extra-insensitive shaper of a mode; parameters as for `zv`."""
     half, K = half_period(omega, zeta)
     V = EI_RESIDUAL
-    # Where so much damping leaves less than V by itself, the middle impulse vanishes.
+    # If the damping is so high that less than V is left without it, the middle impulse vanishes.
     cosine = max((2.0 * K**2 - V * (1.0 + K**2)) / (2.0 * K**2 + 2.0 * K * V), 0.0)
     return _spaced(half, [1.0, 2.0 * K * cosine, K**2])
 
@@ -212,7 +212,7 @@ def _spaced(spacing, train):
     return Shaper(spacing * np.arange(train.size)[kept], train[kept] / train.sum())
 
 
-#: By how much each mode's motion gets longer: half a period (ZV), 3/4, 1 (ZVD, EI), 3/2 (2hump_ei, ZVDD).
+#: Shapers by name. A motion gets longer by 1/2 (ZV), 3/4 (MZV), 1 (ZVD, EI) or 3/2 (2hump_ei, ZVDD) periods per mode.
 SHAPERS = {
     "zv": zv,
     "mzv": mzv,
@@ -326,7 +326,7 @@ def for_arm(model, q, kind, modes=2) -> Shaper:
     Raises
     ------
     DesignError
-        If the arm has not that many modes, and as for `for_modes`.
+        If the arm does not have that many modes, and as for `for_modes`.
     """
     omega, zeta = modes_at(model, q)
     if not 1 <= modes <= omega.size:

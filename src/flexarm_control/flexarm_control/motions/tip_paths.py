@@ -4,8 +4,8 @@ r"""Paths of the tip in space, a straight line or a circular arc, as motions of 
 The path :math:`x(s)`, s from 0 to 1, is turned into joint angles Q(s) by the inverse kinematics of the arm at rest
 (`flexarm_dynamics.models.inverse_kinematics`). That arm is bent by its weight, so that the *bent* arm's tip is on the
 path. Each solution begins at the previous one, so that Q has no jumps. Q is the spline of degree five through the
-solutions; points are added until its tip is within `TOLERANCE` of the path everywhere. With a time law
-:math:`\sigma(t)`,
+solutions. The number of points is doubled until, midway between them, its tip is within `TOLERANCE` of the path. With a
+time law :math:`\sigma(t)`,
 
 .. math:: q = Q(\sigma),\quad \dot q = Q'\dot\sigma,\quad
     \ddot q = Q''\dot\sigma^2 + Q'\ddot\sigma.
@@ -71,7 +71,7 @@ def line(model, start, end, law) -> TipPath:
     Raises
     ------
     TrajectoryError
-        If the path can't be followed to its end; it names the fraction that can, and how near the tip comes.
+        If the path can't be followed to its end; it names the fraction that can be followed, and how near the tip gets.
     """
     end, start = checked(model, end, start)
     kinematics = TipKinematics(model)

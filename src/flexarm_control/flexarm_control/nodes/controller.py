@@ -40,7 +40,7 @@ class ControllerNode(ArmNode):
 
     def __init__(self):
         super().__init__("controller", parameter_groups())
-        # A thread that designs gives the interpreter's lock back to the control path within this time; 5 ms are usual.
+        # A thread that designs gives the interpreter's lock to the control path within this time; the default is 5 ms.
         sys.setswitchinterval(1e-4)
         self._workers = ()
 
@@ -86,7 +86,7 @@ class ControllerNode(ArmNode):
             return default(arm, *wanted, lambda _, *task: designer.find(*task))
 
         if not is_cached(arm, *wanted):
-            designer.start()  # here, since it would end with the thread that waits
+            designer.start()  # in this thread: the process ends with the thread that starts it
         found = self.wait_for(make, f"designing the control of {arm.name}")
         parameters.adopt(found.parameters)
         return found

@@ -12,7 +12,7 @@ from flexarm_dynamics.errors import FlexarmError
 
 from .controller_parameters import of_design, of_limits
 
-#: After a design the next one waits as long as it took, at most for this time [s].
+#: After a design the next one waits for as long as that design took, but at most for this time [s].
 MAX_PAUSE = 0.2
 
 
@@ -25,8 +25,7 @@ class Designs:
     """Applies changed parameters, or sets them back to the active ones.
 
     If changes come faster than designs are made, as from a slider, the newest is designed. If it is refused, the newest
-    one before it that is not refused is taken. Between two designs the processor is left to the control path for a
-    while.
+    earlier one that is not refused is taken. A pause between two designs leaves the processor to the control path.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ class Designs:
     def _redesign(self):
         """In the design thread: replace the old control as a whole by the new one, or set the parameters back."""
         newest_first = [self._waiting.popleft() for _ in range(len(self._waiting))][::-1]
-        if not newest_first:  # taken into account with a newer change
+        if not newest_first:  # an earlier call has taken this change, too
             return
         begun, newest = monotonic(), newest_first[0]
         any(self._designed(values) for values in newest_first)
@@ -121,7 +120,7 @@ class Designs:
         self._node.hand_over(self._node.set_parameters_atomically, old)
 
     def carry(self, payload):
-        """Have the control designed for another payload, a multiple of the arm file's, and taken over at rest."""
+        """Have the control designed for another payload, a multiple of the arm file's; it is taken if the arm rests."""
         if not self._carries:
             self._carries = True
             self._thread.submit(self._carry, payload)
@@ -132,7 +131,7 @@ class Designs:
             law = self._designer.design({**self._design, "payload_scale": payload})
         except CancelledError:
             return
-        except Exception as error:  # of a user's law, too
+        except Exception as error:  # a user's law may raise anything
             self._node.hand_over(self._carried, None, payload, str(error))
         else:
             self._node.hand_over(self._carried, law, payload)

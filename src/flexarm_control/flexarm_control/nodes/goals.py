@@ -39,10 +39,10 @@ PARAMETERS = (
         " five times as long. A controller that sends its state has sixty times as long to judge a trajectory."
     ),
 )
-#: Times between two looks at the arm, and before a trajectory without an answer is sent again (wall time) [s].
+#: Time between two checks of the goals; time after which a trajectory without an answer is sent again (wall time) [s].
 LOOK, AGAIN = 0.01, 1.0
-#: The wait for an answer is this many times longer than for a state: from a silent controller, and from one that sends
-#: its state. The latter first judges a trajectory's torque, in a process that may have just been started.
+#: A goal waits for its answer this many times as long as `state_timeout`: if the controller is silent, and if it sends
+#: its state. In the latter case it may be judging the trajectory's torque, in a process that has just been started.
 PATIENCE, JUDGING = 5.0, 60.0
 #: Beginnings of refusals that have their own error code.
 REFUSALS = {
@@ -92,7 +92,7 @@ class Goal:
     handle : ServerGoalHandle
     tolerances : Tolerances
     message : JointTrajectory
-        The trajectory that is offered, under its own name.
+        Trajectory to offer; its frame_id is the name of the goal.
     """
 
     def __init__(self, server, handle, tolerances, message):
@@ -145,7 +145,7 @@ class GoalsNode(ArmNode):
         return GoalResponse.ACCEPT if self.active else GoalResponse.REJECT
 
     def may_cancel(self, handle):
-        """Accept for a goal that is under way; it is cancelled once the arm has stopped."""
+        """Accept if the goal is under way; it is cancelled once the arm has stopped."""
         known = any(each.handle == handle for each in self._goals)
         return CancelResponse.ACCEPT if known else CancelResponse.REJECT
 
@@ -189,7 +189,7 @@ class GoalsNode(ArmNode):
             self._state, self._came = state, now
         if not self._goals:
             return
-        # New goals first, since the controller's answer to one is the end of the one before.
+        # New goals first: when the controller accepts one, the goal before it ends.
         for each in sorted(self._goals, key=lambda one: one.check is not None):
             if each in self._goals and (outcome := self._judge(each, state, estimate, now)):
                 self._end(each, outcome)
@@ -200,7 +200,7 @@ class GoalsNode(ArmNode):
                     each.handle.publish_feedback(self._feedback(each.server.action_type))
 
     def _judge(self, each, state, estimate, now):
-        """The `Outcome` of a goal at this look; None while it is under way."""
+        """The `Outcome` of a goal at this check; None while it is under way."""
         timeout = self.parameters["state_timeout"]
         if each.check is None:
             silent = now - max(self._came, each.began) > timeout
@@ -235,7 +235,7 @@ class GoalsNode(ArmNode):
         )
 
     def _offered(self, each, state, now, patience):
-        """Look for the controller's answer to a goal that was offered."""
+        """Check whether the controller has answered an offered goal; the `Outcome` if it is refused or not answered."""
         if state is not None and state.judged_trajectory == each.name:
             if state.judged_reason:
                 field = state.judged_reason.partition(":")[0]

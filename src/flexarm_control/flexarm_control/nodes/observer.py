@@ -102,7 +102,7 @@ class ObserverNode(ArmNode):
             self.report(f"arm_state {msg.sequence}: {error}")
             self._forward_distrusted(self._states.message(raw), str(error))
             return
-        if known is None:  # older than the last one, and useless for the controller
+        if known is None:  # older than the last one: the controller can't use it
             return
         if sample.doubt:
             self.report(f"arm_state: {sample.doubt}")

@@ -29,7 +29,7 @@ class CalledController(ControllerNode):
             super().make_control_path(subscription, *args, **kwargs)
 
     def take(self, message):
-        """Take an estimate; the control path replaces this method once the node is configured."""
+        """Take an estimate; when the node is configured, its callback replaces this method."""
 
 
 class Handover:

@@ -69,7 +69,7 @@ PARAMETERS = (
 )
 #: Prefix of the parameters that may change at run time.
 GROUP = "shaper."
-#: Time between two looks at whether a motion has ended; largest age of measured positions that are used [s].
+#: Time between two checks whether a motion has ended; maximum age of measured positions that are used [s].
 LOOK, FRESH = 0.01, 1.0
 
 
@@ -335,7 +335,7 @@ class ShaperNode(ArmNode):
             self._speeds = np.full(found.size, np.nan)
 
     def _where(self):
-        """Where the joints are (n,), None if that is unknown; a motion that is played begins there, without a step.
+        """Where the joints are (n,), None if unknown; a played motion begins there, to avoid a step.
 
         Raises
         ------
@@ -449,7 +449,7 @@ class ShaperNode(ArmNode):
             raise ParameterError(f"has no stream of {named}", field=field, hint=hint)
 
     def _on_play(self):
-        """Send the position of the shaped motion now, from the first trajectory on."""
+        """Send the present position of the shaped motion; nothing before the first trajectory."""
         now = self.now_ns()
         state = self.core.state(now) if self.active else None
         if state is not None:

@@ -41,7 +41,7 @@ class Goal:
 
     def __init__(self, server, handle, client):
         self.server, self.handle, self.client = server, handle, client
-        self.sent = 0  # goals sent on; results of all but the last don't count
+        self.sent = 0  # goals sent to the controller; only the last one's result counts
         self.over = False
         self.reason = ""
         self.tolerances = self.check = None  # if the node plays it
@@ -142,17 +142,17 @@ class ShaperGoals:
             self._send(goal, goal.handle.request)
 
     def _announce(self, goal, last):
-        """Publish the first feedback: its stamp is the shaped motion's start, `desired` the end with the time to it."""
+        """Publish the first feedback: its stamp is the shaped motion's start, `desired` its last point."""
         feedback = goal.server.action_type.Feedback(joint_names=self._node.joint_names)
         set_stamp(feedback.header.stamp, self._node.started_ns)
         feedback.desired = last
         goal.handle.publish_feedback(feedback)
 
     def may_cancel(self, handle):
-        """Stop smoothly for a goal that is under way; it is cancelled once that is done."""
+        """Stop smoothly for a goal that is under way; it is cancelled once the stop is done."""
         goal = self._preparing
         if goal is not None and goal.handle == handle:
-            # Its state changes once this is accepted, and then it can end; the motion before it goes on.
+            # The goal can end only after this answer: the node's thread ends it later. The motion under way goes on.
             self._preparing = None
             self._node.job.forget()
             error = TrajectoryError("cancelled before it began", field="trajectory")
@@ -166,7 +166,7 @@ class ShaperGoals:
         return CancelResponse.ACCEPT
 
     def replace(self, message):
-        """Send a trajectory in place of that of the goal under way; returns whether there is one."""
+        """Replace the trajectory of the goal under way (a played one notes a stop); returns whether there is a goal."""
         if self._current is None:
             return False
         if self._node.plays:
@@ -215,7 +215,7 @@ class ShaperGoals:
         self._finish(goal, GoalStatus.STATUS_SUCCEEDED, goal.server.action_type.Result())
 
     def tell(self, state, measured):
-        """Publish the feedback of a played goal, and abort it beyond its tolerances; arguments as for `look`."""
+        """Publish the feedback of a played goal, and abort it if it leaves its tolerances; arguments as for `look`."""
         goal = self._current
         if goal is None:
             return
@@ -235,7 +235,7 @@ class ShaperGoals:
             self._abort(goal, outcome.text)
 
     def _blind(self, goal, measured):
-        """End a goal with tolerances if the joints' positions do not come; returns whether that is so."""
+        """Abort a goal with tolerances if no joint positions are received; returns whether it did."""
         limits = goal.tolerances
         judged = np.isfinite(limits.path).any() or np.isfinite(limits.goal).any()
         if measured is not None or not judged:

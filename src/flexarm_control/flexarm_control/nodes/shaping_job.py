@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from flexarm_dynamics.errors import TrajectoryError
 
-#: Number of trajectories that are worked on at once, since one that was replaced is not waited for.
+#: Number of trajectories that are computed at once: a new one does not wait for the one that it replaces.
 THREADS = 2
 #: A motion under way is replaced this much later than requested, so that there is time to compute the next one [ns].
 AHEAD = 100_000_000
@@ -17,7 +17,7 @@ class Job:
     Parameters
     ----------
     prepare, quick : callable
-        Give its plan: `prepare` in any thread, where it may take long; `quick` in the node's own, at its due time.
+        Return its plan: `prepare` may take long, in any thread; `quick` is called in the node's own, at its due time.
     due_ns : int or None
         When it replaces the motion under way [ns]; None: there is none, and it begins once it is ready.
     done, refused : callable
@@ -34,7 +34,7 @@ class Job:
         self.result, self.ready = result, True
 
     def finished(self, now_ns):
-        """Whether its result can be used at a time [ns]; at its due time the quick one is made if there is none."""
+        """Whether its result can be used at a time [ns]; if there is none at its due time, `quick` makes one."""
         if isinstance(self.result, TrajectoryError) or self.due_ns is None:
             return self.ready
         if now_ns < self.due_ns:

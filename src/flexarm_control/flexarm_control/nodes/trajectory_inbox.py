@@ -17,7 +17,7 @@ from .. import trajectory
 MAX_POINTS = 10_000
 #: Trajectories that come within this time of each other, by the arm's clock, are a stream [ns].
 STREAMED = 500_000_000
-#: A motion is offered at least this long before its own start [ns].
+#: Work on a plan ends this long before the motion's own start; what is not ready by then is left out [ns].
 IN_TIME = 30_000_000
 
 
@@ -101,7 +101,7 @@ class TrajectoryInbox:
         reference = self._core.reference
         plan, start = None, reference.resting
         ahead = reference.ahead(data)
-        whole = ahead.stamp_ns == data.stamp_ns  # a plan is for all of it
+        whole = ahead.stamp_ns == data.stamp_ns  # a plan covers the whole trajectory
         try:
             if feedforward is not None and feedforward.plans and start is not None and whole:
                 plan = self._designer.prepare(
@@ -120,12 +120,12 @@ class TrajectoryInbox:
         self._node.hand_over(self._offer, data, plan, name)
 
     def _in_time(self, data):
-        """Whether a plan is still of use: a trajectory with stamp 0 waits for it, another one begins without."""
+        """Whether a plan is still of use: a trajectory with stamp 0 waits for it, one with a stamp does not."""
         now = self._core.reference.stamp_ns
         return now is None or not data.stamp_ns or now < data.stamp_ns - IN_TIME
 
     def _judge_torque(self, data):
-        """Refuse a trajectory that needs more torque than there is, by a `TrajectoryError`."""
+        """Raise a `TrajectoryError` for a trajectory that needs more torque than is allowed."""
         reference, limit = self._core.reference, self._core.torque_allowed
         if not (np.isinf(limit).all() or reference.repeats(data)):
             ahead = reference.ahead(data)
@@ -144,7 +144,7 @@ class TrajectoryInbox:
             self._log(f"trajectory refused: {verdict.reason}")
 
     def _log(self, text, info=False):
-        """Log the result of a trajectory; of a stream, whose lines differ in their numbers, one in ten seconds."""
+        """Log the result of a trajectory; in a stream, texts that differ only in numbers at most every ten seconds."""
         last, now = self._last_came, self._core.reference.stamp_ns
         log, self._last_came = self._node.get_logger(), now
         if last is not None and now is not None and now - last < STREAMED:

@@ -9,8 +9,8 @@ difference of (2) for two payloads and for one. With it, the mode rows (s) and t
     Y_u\,(\theta - 1) &= u - \left(M_{11}\ddot q + M_{12}\ddot\delta + f_1 + C_1\dot\delta + K_1\delta\right).
 
 q, delta and u pass the same `LowPass`, which gives their derivatives. Each set of rows is solved by itself, with the
-weights W (the modes' compliance, or one over the square of a joint's friction) and with sums over time that forget with
-the time constant `MEMORY`. The half width of a set's interval is
+weights W (the modes' compliance, or one over the square of a joint's friction). Its sums over time forget with the time
+constant `MEMORY`. The half width of a set's interval is
 
 .. math::
     h_s &= \kappa\,\frac{|Y_s^TWK_2\delta|}{Y_s^TWY_s}
@@ -18,13 +18,14 @@ the time constant `MEMORY`. The half width of a set's interval is
     h_u &= \gamma\,\frac{|Y_u^TWu|}{Y_u^TWY_u} + \sum_j\frac{|Y_{uj}W_jF_j\,\mathrm{sgn}\,\dot q_j|}{Y_u^TWY_u}
            + 3\sigma_u,
 
-for links that are stiffer by a fraction kappa (`STIFFNESS`), with the zero and noise epsilon_0 of each gauge, a drive
-that gives more torque by gamma (`DRIVE`), unmodelled friction F, and sigma of the residual. Sums are taken before the
-magnitude, so an error that lowers theta while the arm accelerates and raises it while it brakes cancels.
+for links that are stiffer by a fraction kappa (`STIFFNESS`), zero and noise epsilon_0 of each gauge, a drive whose
+torque is higher by a fraction gamma (`DRIVE`), unmodelled friction F, and sigma of the residual. Sums are taken before
+the magnitude, so an error that lowers theta while the arm accelerates and raises it while it brakes cancels.
 
 The two sets check each other: a gauge that is dead, stuck or of the wrong sign changes only the first, a drive or
-friction only the second. theta lies in both intervals, weighted by one over their squares. It may be used if each
-interval is narrow enough, they overlap, the residuals are small, and theta is between 0 and its limit.
+friction only the second. theta is the mean of both, weighted by one over the squares of the half widths,
+and kept within the intersection of the intervals. It may be used if each interval is narrow enough, the intervals
+overlap, the residuals are small, and theta is between 0 and its limit.
 """
 
 import numpy as np
@@ -53,17 +54,20 @@ PARAMETERS = (
 
 #: Fractions by which links may be stiffer and drives stronger than in the arm file [-].
 STIFFNESS, DRIVE = 0.15, 0.05
-#: Unmodelled friction, in parts of the torque limit, and of the file's Coulomb friction at rest and in motion [-].
+#: Unmodelled friction: as a fraction of the torque limit, plus a fraction of the file's Coulomb friction, at rest and
+#: in motion [-].
 UNSTATED, STICKING, SLIDING = 0.01, 1.0, 0.3
-#: Time between two evaluations [s], and time constants of the sums, in the time in which they grow [s].
+#: Time between two evaluations [s], and time constants of the sums [s]; their time counts only while they are updated.
 INTERVAL, MEMORY = 0.008, {REST: 1.0, ONLINE: 3.0}
 #: Joints that turn more slowly may stick [rad/s].
 SLOW = 0.01
-#: theta may be used if the half width of each set's interval, and of both together, are smaller, over theta or 1 [-].
+#: theta may be used if the half width of each set's interval, and that of the intersection of both, are at most this
+#: times the larger of theta and 1 [-].
 WIDE, NARROW = 2.0, 0.4
 #: Fraction of the square of strains or torques that the fit may leave [-].
 MISFIT = 0.04
-#: Nothing is learnt while one more payload strains the links less than this times what the gauges' zeros may [-].
+#: Nothing is learnt while the strain due to one more payload is less than this fraction of the gauges' possible zeros,
+#: both weighted as in the fit [-].
 EXCITED = 0.1
 #: The sums must have grown for this long [s].
 LEARNT = 0.5

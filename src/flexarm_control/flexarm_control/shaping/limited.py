@@ -19,9 +19,9 @@ from flexarm_dynamics.errors import DesignError, TrajectoryError
 from .piecewise import PiecewiseMotion
 
 #: Number of spline points at which TOPP-RA keeps the limits, for each piece between two given points; and minimum and
-#: maximum of their total without the given points. Each is a point of the motion, and a shaper multiplies them.
+#: maximum of their total without the given points. Each is a point of the motion; a shaper multiplies their number.
 GRID, FEWEST, MOST = 50, 100, 800
-#: A step of the grid that ends closer to a given point than this fraction of the step ends at the point.
+#: A grid point closer to a given point than this fraction of a grid step is left out: the given point replaces it.
 CLOSE = 0.1
 #: Points closer to each other than this count as one [rad].
 SAME = 1e-7
@@ -151,7 +151,7 @@ def _grid(length):
     even = np.linspace(0.0, length[-1], count + 1)
     after = np.clip(np.searchsorted(length, even), 1, length.size - 1)
     apart = np.minimum(np.abs(even - length[after - 1]), np.abs(even - length[after]))
-    # If a place differs from a point only by rounding, the speeds differ by more than the distance allows.
+    # At two places that differ only by rounding, TOPP-RA's speeds would differ by more than the distance allows.
     return np.union1d(even[apart > CLOSE * even[1]], length)
 
 

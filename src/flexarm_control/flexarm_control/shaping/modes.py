@@ -142,7 +142,7 @@ class Modes:
                 )
 
     def _designed(self):
-        """Stages: one for each mode, or one for all of them if their ratios must stay anyway."""
+        """Stages: one for each mode; for the types robust and retimed one for all modes, in the phase of the lowest."""
         frequencies, dampings = self.frequencies.mean(axis=0), self.dampings.mean(axis=0)
         if self.kind == NONE:
             return ()
@@ -201,7 +201,7 @@ class Modes:
         if len(self.frequencies) == 1:
             return np.repeat(self.frequencies, len(q), axis=0)
         squared = ((q[:, None] - self.configurations) ** 2).sum(axis=2)
-        # Products without the own factor are right at the configurations, too.
+        # Products of the other distances stand for 1/distance^2: they are finite at the configurations, too.
         weights = np.stack(
             [np.delete(squared, c, axis=1).prod(axis=1) for c in range(squared.shape[1])], axis=1
         )

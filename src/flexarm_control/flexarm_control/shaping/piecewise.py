@@ -14,7 +14,7 @@ from ..trajectory.path import hermite
 
 #: Number of coefficients of a polynomial, of degree 5 at most.
 ORDER = 6
-#: Time between the knots of a motion that stands [s].
+#: Time between the two knots of a motion at rest [s].
 MOMENT = 1e-3
 
 
@@ -28,7 +28,7 @@ class PiecewiseMotion(Motion):
     coefficients : (k, 6, n) ndarray
         c_0 ... c_5 of each piece: the position is sum_i c_i x^i, x from the piece's first knot [s].
     fields : int
-        Fields that points need to write it: 1: positions, 2: and velocities, 3: and accelerations.
+        Number of fields that its points have: 1: positions; 2: also velocities; 3: also accelerations.
     end : (n,) ndarray, optional
         Exact end position; if not given, that of the last polynomial [rad].
     """
@@ -104,11 +104,11 @@ class PiecewiseMotion(Motion):
         return PiecewiseMotion(self.knots[first:], self.coefficients[first:], self.fields, self.end)
 
     def until(self, time):
-        """Return the motion up to a time after its first knot [s]."""
+        """Return the motion up to a time [s], which must be later than its first knot."""
         count = int(np.searchsorted(self.knots, time, side="left"))
         knots = np.append(self.knots[:count], time)
         coefficients = self.coefficients[: count if count < len(self.knots) else None]
-        if count == len(self.knots):  # it has ended before, and holds
+        if count == len(self.knots):  # the motion ends before this time, and then holds its end
             hold = np.zeros((1, *coefficients.shape[1:]))
             hold[0, 0] = self.end
             coefficients = np.concatenate([coefficients, hold])

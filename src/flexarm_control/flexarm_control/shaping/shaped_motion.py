@@ -13,20 +13,22 @@ at constant phases :math:`\varphi_i`, and
     \dot\tau_i = \frac{f(t)}{f(\tau_i)}, \qquad
     \ddot\tau_i = \frac{\dot f(t) - \dot\tau_i^2 \dot f(\tau_i)}{f(\tau_i)}.
 
-A motion r that leaves no vibration by itself (see `time_law`) may be changed to w on the way, by a stop, say. It then
-becomes :math:`r + S(w - r)`: only the change is shaped, and nothing jumps. Where it is not changed, it stays as it is.
+A motion r that leaves no vibration by itself (see `time_law`) may be changed to w on the way, for example by a stop. It
+then becomes :math:`r + S(w - r)`: only the change is shaped, and nothing jumps. Where it is not changed, it stays as it
+is.
 
 Several modes are shaped one after the other. All A_i are at least 0 and add up to 1. So every position lies between
-the motion's own, start and end are its own, and with constant frequencies speed and acceleration are never larger. The
-frequency at a time is that at the shaped position of that time. So the part that is shaped already never depends on
-later commands. The less a frequency changes within a period, the less vibration is left.
+positions of the motion, start and end do not change, and with constant frequencies speed and acceleration are never
+larger than the motion's. The frequency at a time is that at the shaped position of that time. So the part that is
+shaped already never depends on later commands. The less a frequency changes within a period, the less vibration is
+left.
 """
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-#: Number of places per period of the lowest mode at which changing frequencies are evaluated, and at which a motion is
-#: written that points at its knots alone do not give.
+#: Number of places per period of the lowest mode. Changing frequencies are evaluated at these places. A motion that
+#: points at its knots alone do not reproduce gets points at them, too.
 PER_PERIOD = 32
 #: Knots closer to each other than this count as one [s].
 SAME = 2e-6
@@ -126,7 +128,7 @@ class ShapedMotion:
                     (s.cycles, s.amplitudes, Warp(times, found[:, s.mode])) for s in modes.stages
                 ]
                 where = self.states(times)[0]
-        elif modes.stages and quiet is not motion:  # as one stage, since delays add up
+        elif modes.stages and quiet is not motion:  # as one stage: constant delays add up
             train = modes.constant()
             self._stages = [(train.times, train.amplitudes, Constant(1.0))]
         else:

@@ -30,8 +30,8 @@ mostly in phase with the correction, and changes the frequency a little, not the
 
 A velocity command receives the correction's rate, whose integral is the correction.
 
-The bounds keep the correction a sine, because a clipped one would come late. The constant reading of a stuck sensor
-becomes bias, and the correction dies out.
+The bounds scale the correction instead of clipping it, so it stays a sine: a clipped one would come late. The constant
+reading of a stuck sensor becomes bias, and the correction dies out.
 """
 
 import cmath
@@ -82,13 +82,14 @@ PARAMETERS = (
         " start."
     ),
 )
-#: The loop must be stable with a frequency off by this fraction.
+#: The loop must be stable with the mode's frequency off by this fraction.
 MARGIN = 0.15
 #: Ratio of the rate of the bias to that of the observer [-].
 DRIFT = 0.1
-#: A reading counts for at most this many periods, since longer steps would overshoot.
+#: After a gap, a reading corrects the observer for at most this many periods: a longer step would overshoot.
 LATE = 2.0
-#: After `max_saturated` at the bounds, the mode must swing less than this fraction of the largest swing since [-].
+#: After `max_saturated` at the bounds, the mode must swing less than this fraction of its largest swing in that time
+#: [-].
 LESS = 0.9
 #: Number of periods of a burst; after its end the drive has this fraction of a period to settle.
 BURST_PERIODS, SETTLE = 2.0, 0.25
@@ -120,7 +121,7 @@ def moved(z, p, beta, u, time):
 
 
 def burst(frequency, amplitude, period):
-    """Corrections that excite the mode, from 0 to 0: a sine in a Hann window (k,) [rad].
+    """Corrections that excite the mode, and begin and end at 0: a sine in a Hann window (k,) [rad].
 
     Parameters
     ----------
@@ -250,7 +251,7 @@ class StrainDamping:
         the sensor                         what happens
         ================================== ================================================================
         silent, NaN, beyond full scale,    the observer goes on without it; after `timeout` the correction
-        with a stamp that is not new       fades out, until the sensor has been good for `rejoin`
+        with an old or repeated stamp      fades out, until the sensor has been good for `rejoin`
         good                               the correction damps, within size and rate
         ================================== ================================================================
 

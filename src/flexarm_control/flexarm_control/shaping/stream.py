@@ -55,9 +55,9 @@ class StreamShaper:
     Attributes
     ----------
     started : bool
-        Whether it has a value.
+        Whether it has had a first value.
     output : (n,) ndarray
-        The last one, once started.
+        The last shaped value, once started.
     """
 
     def __init__(self, modes, joint_names):
@@ -109,7 +109,7 @@ class StreamShaper:
         period : float
             Time since the previous input, above 0 [s].
         configuration : (n,) array_like, optional
-            Joint positions, if the stream has none [rad]; if not given, the last output.
+            Joint positions, for a stream of velocities [rad]; if not given, the last output.
         """
         if not self.started:
             return self.begin(value)

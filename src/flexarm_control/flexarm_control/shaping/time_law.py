@@ -57,21 +57,22 @@ FLOOR = 0.3
 COUPLED, COUPLED_FACTORS = 10.0, 3
 #: Number of solutions, each along the previous one.
 ROUNDS = 3
-#: A motion is straight if it stays this close to its line, over its length [-].
+#: A motion is straight if its distance from its line, relative to its length, is at most this [-].
 STRAIGHT = 1e-4
-#: Time for a stop over what the largest acceleration needs, plus `modes.periods`; factor if it must be longer.
+#: First duration of a stop relative to what the largest acceleration needs, to which `modes.periods` are added; factor
+#: for the next, longer one.
 STOP, LONGER = 1.3, 1.3
 #: Within the limits, a stop may accelerate this many times as much as the motion does [-].
 HARDER = 1.3
 #: Rounding of the speeds [-].
 SLACK = 1e-9
-#: A linear programme is given up after this many iterations; some 100 are usual. This is a count, so that a busy
-#: computer finds the same motion.
+#: A linear programme is given up after this many iterations; some 100 are usual. It is a count, not a time, so that
+#: a busy computer finds the same motion.
 ITERATIONS = 10_000
 
 
 def along(motion):
-    """Progress of a motion on its line at times (k,), with its first two derivatives; None if it is not straight.
+    """Progress of a straight motion from rest to rest on its line, with two derivatives; None for any other motion.
 
     Parameters
     ----------
@@ -80,7 +81,8 @@ def along(motion):
     Returns
     -------
     callable or None
-        ``progress(order, times)``, from 0 to 1 [-], [1/s], [1/s^2].
+        ``progress(order, times)`` at times (k,), from 0 to 1 [-], [1/s], [1/s^2]. None also if points have positions
+        only.
     """
     size = float(motion.angle @ motion.angle)
     if size == 0.0 or motion.fields == 1:
@@ -119,7 +121,7 @@ def retimed(motion, modes, velocity=np.inf, acceleration=np.inf):
     Returns
     -------
     PiecewiseMotion or None
-        None if the motion is not straight, or there is no such time law within the limits.
+        None if `along` gives None, or if there is no such time law within the limits.
     """
     found = solved(motion, modes, velocity, acceleration)
     return None if found is None else found[0].motion(found[2])
@@ -174,7 +176,7 @@ def _gentle(motion, modes):
 
 
 def leaves(motion, modes):
-    """Amplitudes that a straight motion leaves of each mode, at factors of the frequencies over the spread.
+    """Amplitudes that a straight motion leaves in each mode, at factors of the frequencies over the spread.
 
     Parameters
     ----------
@@ -205,7 +207,7 @@ def stopped(motion, modes, time, acceleration=np.inf):
     Returns
     -------
     PiecewiseMotion
-        The motion itself if it ends as early.
+        The motion itself if no stop ends earlier, or if it is not straight.
     """
     progress = along(motion)
     if progress is None or time >= motion.knots[-1]:
@@ -365,7 +367,7 @@ class Law:
         return PiecewiseMotion.through(given.knots[0] + slower * self.nodes, made[: given.fields])
 
     def left(self, x, line):
-        """Complex amplitude that each acceleration of x leaves of a `line`'s modes, on the motion by x, (m, N - 1)."""
+        """Complex amplitude that a unit of each acceleration of x leaves in a `line`'s modes, along x, (m, N - 1)."""
         found = line.left(self._middle_progress(x), self._steps, self._parts)
         return np.array([values[FACTORS // 2, 1:] for values in found])
 
@@ -387,7 +389,7 @@ class Law:
         return float(np.maximum(speed[:-1] + rise, speed[1:]).max())
 
     def solution(self, norms, sigma, acceleration=np.inf, coupled=True):
-        """The accelerations x that leave least; None if there are none within the limits.
+        """The accelerations x that leave the least vibration; None if there are none within the limits.
 
         Parameters
         ----------

@@ -37,9 +37,9 @@ PARAMETERS = (
         "Largest jerks, for the time law jerk_limited."
     ),
 )
-#: Time laws of the unshaped motion: that of its points, the quickest of `limited`.
+#: Time laws of the unshaped motion: that of its points, or one of the two quickest of `limited`.
 GIVEN, JERK_LIMITED, TIME_OPTIMAL = TIME_LAWS = "given", "jerk_limited", "time_optimal"
-#: Limits that each needs, and the library that computes it.
+#: Limits that each quickest time law needs, and the library that computes it.
 NEEDS = {
     JERK_LIMITED: (("velocity", "acceleration", "jerk"), "ruckig"),
     TIME_OPTIMAL: (("velocity", "acceleration"), "toppra"),
@@ -50,16 +50,18 @@ BESIDE = 1e-3
 MAX_POINTS = 20_000
 #: How far a first point at time 0 may be from where the joints are [rad].
 START_TOLERANCE = 0.05
-#: Number of attempts to slow a motion down into its limits, and by how much more than needed: twice as much each time,
-#: up to the last value. A motion shaped with a slow mode comes near its limit by a thousandth at a time.
+#: Number of attempts to slow a motion down to its limits; first and maximum fraction by which it is slowed down more
+#: than needed. The fraction doubles with each attempt. A motion shaped with a slow mode comes near its limit by a
+#: thousandth at a time.
 ATTEMPTS, MARGIN, MOST = 60, 1e-9, 1e-3
 #: Places in each piece at which its speed and acceleration are evaluated, as fractions of its length.
 PLACES = np.linspace(0.0, 1.0 - 1e-6, 9)
 #: Number of points of a stop, its shortest duration [s], and the ratio of the durations that are tried.
 STOP_POINTS, MIN_STOP, LONGER = 24, 0.05, 1.15
-#: Without limits: acceleration of a stop over the motion's own, and its minimum for each rad/s of speed [1/s].
+#: Without limits a stop may accelerate this many times as much as the motion [-], and at least this much per rad/s of
+#: speed [1/s].
 STOP_ACCELERATION, STOP_RATE = 1.3, 4.0
-#: When a motion is handed over under way, its first point comes this much later [s].
+#: If a motion replaces one under way, its first point is at least this much later than its time 0 [s].
 HANDOVER = 0.01
 
 
@@ -222,12 +224,13 @@ class TrajectoryShaper:
         measured : (n,) array_like, optional
             Where the joints are [rad].
         quick : bool
-            Shape without a new time law, which takes milliseconds.
+            Shape without a new time law: this takes only milliseconds.
 
         Raises
         ------
         TrajectoryError
-            If it has no beginning, can't be kept within the limits, or gets too many points; then nothing changes.
+            If it is over, can't begin where the joints are, can't be kept within the limits, or gets too many points;
+            then nothing changes.
         """
         start_ns = max(trajectory.stamp_ns, now_ns) if trajectory.stamp_ns else now_ns
         moving = self.moving(now_ns)
@@ -412,7 +415,7 @@ class TrajectoryShaper:
         now_ns : int
             [ns]
         quick : bool
-            Without a new time law, which takes longer to compute and stops sooner.
+            Stop without a new time law. A new one takes longer to compute, but stops sooner.
 
         Returns
         -------

@@ -90,7 +90,7 @@ class Ringing:
         Parameters
         ----------
         small, motion : PiecewiseMotion
-            The small motion after which the readings are, and the one to be learned, with the same end and direction.
+            The small motion after which the readings were taken, and the one to be learned; same end, same direction.
         times, readings
             As for `amplitudes`, after the small motion.
         """
@@ -124,7 +124,8 @@ class Trials:
     motion : PiecewiseMotion
         The motion to make next.
     best : PiecewiseMotion
-        The motion that has swung least; at first that of `time_law.solved`, by the modes alone: a trial shows the rest.
+        The motion that has left the least vibration; at first that of `time_law.solved` for the modes alone. The trials
+        show what that leaves out.
     least : float
         Swing of the best motion; inf at first.
 
@@ -167,7 +168,7 @@ class Trials:
         Raises
         ------
         MessageError
-            Nothing changes then.
+            For readings that can't be used; then nothing changes.
         """
         seen = self._ringing.amplitudes(times, readings)
         x, h = self._x, self._answer

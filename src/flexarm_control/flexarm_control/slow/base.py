@@ -36,8 +36,8 @@ class SlowLaw(Law, ABC):
 
     #: True for a law that leaves the joints free.
     drifts = False
-    #: True for a law whose `model` changes as it learns. The slow manifold follows that change; a simulation of the arm
-    #: file's arm would not. So such a law has no feed-forward.
+    #: True for a law whose `model` changes as it learns. The slow manifold follows this change, but a feed-forward,
+    #: which simulates the arm of the arm file, would not. So such a law has no feed-forward.
     learns = False
 
     #: True for a law whose torque is its `nominal` torque plus a `feedback` of the error that needs no terms.

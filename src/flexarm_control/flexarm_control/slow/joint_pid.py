@@ -10,8 +10,9 @@ The feedback passes a low-pass filter (`flexarm_control.low_pass`).
 The gains are diagonal, in torque per angle. `flexarm design` makes gains for this slow law, together with a constant
 feedback of the deflections (`fast.type: fixed_gain`) on the manifold of the reference. Gains of (13) multiply the
 inertia of the arm file. These do not, so a design for an uncertain arm does not change with the file's numbers. The
-integral leaves no error at rest under a payload, friction or weight that the file does not have. On a motion that the
-model explains e is zero, and so is w. w stops at its limit, and does not grow while the torque is beyond the joint's.
+integral removes the error at rest that a payload, friction or weight beyond the file's would leave. On a motion that
+the model explains e is zero, and so is w. w stops at its limit. While the torque is beyond the joint's limit,
+w does not grow in that direction.
 
 Friction holds a joint whose error is small. The integral moves it on only slowly, and a vibration whose torque is less
 than the friction is not damped. So a fraction :math:`\gamma` of the arm file's Coulomb friction is added without the
@@ -32,12 +33,12 @@ where it sticks at the speed :math:`\lambda_\beta e`:
 .. math:: u_b = \max(\beta - \gamma, 0)\,f_c
     \,[\tanh((\dot q_{ref} + \lambda_\beta e)/v_0) - \tanh(\dot q_{ref}/v_0)] .
 
-The friction itself damps this torque: at an amplitude and frequency at which the torque acts as a stiffness k, the
-friction acts as a damper of at least :math:`k/\omega`. Linear loops are judged without these two torques; `flexarm
-design` also has loops of joints that stick, with both (`robust.loop`).
+The friction itself damps this loop: if the torque acts as a stiffness k at some amplitude and frequency :math:`\omega`,
+the friction acts there as a damper of at least :math:`k/\omega`. Linear loops are judged without these two torques;
+`flexarm design` also has loops of joints that stick, with both (`robust.loop`).
 
-There may be several sets of gains, each made for its own configuration (`flexarm_control.schedule`). w is a torque, not
-an angle, so a change of K_w does not move it.
+There may be several sets of gains, each designed for its own configuration (`flexarm_control.schedule`). w is a torque,
+not an angle, so a change of K_w does not change w.
 """
 
 from contextlib import contextmanager
@@ -177,7 +178,7 @@ class JointPid(SlowLaw):
         return u
 
     def _friction(self, qd, expected):
-        """Friction that is cancelled at joint speeds qd and the present error, beyond that at the `expected` speeds.
+        """Friction torque u_f + u_b at joint speeds qd and the present error; the motion has the `expected` speeds.
 
         Speeds are (n,) [rad/s]; the result is (n,) [N m].
         """

@@ -14,8 +14,8 @@ the joints' reference by the same kinematics. Where J has full rank, the tip's e
 :math:`J^*` is the damped inverse of Nakamura & Hanafusa (1986), :math:`\sigma/(\sigma^2 + \lambda^2)` for each
 singular value. The damping :math:`\lambda^2 = \varepsilon^2 - \sigma^2` sets in where sigma is below epsilon and grows
 towards the singularity. The inverse is thus 1/sigma above epsilon and sigma/epsilon^2 below. Below, the tip's law has
-the weight (sigma/epsilon)^2 and y_0 has the rest. So a stretched arm, or a direction in which a planar arm or one joint
-can't move its tip, needs no special case.
+the weight (sigma/epsilon)^2 and y_0 has the rest. So no special case is needed for a stretched arm, or for
+directions in which a planar arm or a single joint can't move its tip.
 
 The law assumes that a and B are as in the arm file, and that the arm is on the same side of a singularity as its
 reference (elbow up or down). Otherwise the tip arrives with the other elbow.

@@ -86,7 +86,9 @@ def read(
 
 
 def write(path, trajectory):
-    """Write a trajectory to a file; `read` gives it back bit by bit, except for its stamp.
+    """Write a trajectory to a file; `read` gives its joints, times and fields back bit by bit.
+
+    Stamp and effort, and the `coast` and `first` of a stream, are not written.
 
     Parameters
     ----------
@@ -273,7 +275,7 @@ def _yaml_values(values, field):
         try:
             if isinstance(value, bool):
                 raise TypeError
-            # YAML 1.1 takes 1e-3 (no dot) for text, but the number is meant.
+            # YAML 1.1 reads 1e-3 (no dot) as text, but the number is meant.
             out.append(float(value))
         except NOT_NUMBERS:
             raise TrajectoryError("is not a number", field=f"{field}[{i}]", value=value) from None

@@ -7,7 +7,8 @@ Here the tip has to rest, too: it may have moved by no more than `tip` within ha
 .. math:: \max_{t-T/2 \le a, b \le t} |p(a) - p(b)|_\infty \le p_{max}, \qquad p = p(q, \delta)
 
 from joint positions and modal amplitudes. A harmonic motion of the amplitude A moves by A to 2 A in that time, whatever
-its phase. So A is at most :math:`p_{max}`. Where the tip rests does not count, as an unknown payload bends the links.
+its phase. So A is at most :math:`p_{max}`. The place where the tip rests does not matter, because an unknown payload
+bends the links.
 """
 
 from collections import deque
@@ -148,7 +149,7 @@ class TipSwing:
         if places and stamp_ns <= places[-1][0]:
             return
         places.append((stamp_ns, np.array(place, float)))
-        # The oldest place that is needed lies half a period back, or `LOOKS` looks.
+        # The oldest place that is needed lies half a period or `LOOKS` looks back, whichever is longer ago.
         while len(places) > LOOKS + 1 and places[1][0] <= stamp_ns - self._span:
             places.popleft()
 

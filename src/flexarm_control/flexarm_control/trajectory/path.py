@@ -14,8 +14,8 @@ whose first three derivatives are zero at both ends. Acceleration, jerk and snap
 
 are then as continuous as those of the trajectory. So a slow manifold, which depends on them, moves without a step.
 
-If a trajectory ends before such a stop would, and hardly farther, it is followed to its end at its own speed. It then
-comes to rest sooner, and with the motion that was planned for the links.
+If a trajectory ends before such a stop would end, and hardly farther, it is followed to its end at its own speed. It
+then comes to rest sooner, and the motion is the one that was planned for the links.
 """
 
 import math
@@ -27,7 +27,7 @@ from .values import SECOND
 
 #: Places of a polynomial at which its acceleration and jerk are evaluated, as fractions of its length.
 PLACES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-#: Velocity and acceleration at a smooth end are at most this fraction of the largest [-].
+#: Velocity and acceleration at a smooth end are at most this fraction of the largest ones on the path [-].
 SMOOTH = 1e-6
 
 
@@ -119,7 +119,7 @@ class Path:
     scaled = False
     #: Largest fraction of a plan's bending beside the slow manifold that may still be there [-].
     kept = 1.0
-    #: The piece that a path ends in: its last state, held.
+    #: Number of the piece after the end, where the last state is held.
     END = -1
 
     def __init__(self, times_ns, derivatives, trajectory_id=0, coast=None, effort=None):
@@ -151,7 +151,7 @@ class Path:
         self._stack = np.zeros((order, 3, n))
         self._once = np.arange(1.0, order)[:, None]
         self._twice = self._once[:-1] * self._once[1:]
-        # The last evaluated state: most stamps are evaluated twice, ahead of time and when sampled.
+        # The last evaluated state. Most stamps are evaluated twice: by the look ahead and by the sample.
         self._last = np.zeros((3, n))
         self._forget_segment()
 
@@ -225,7 +225,8 @@ class Path:
     def peaks(self):
         """Largest speed, acceleration and jerk of every joint on the path, (3, n) [rad/s], [rad/s^2], [rad/s^3].
 
-        Jumps between polynomials are left out. Six places of each are evaluated, which is right to a few thousandths.
+        Jumps between polynomials are left out. Six places of each polynomial are evaluated, so that the values are
+        right to a few thousandths.
         """
         first = self._knots_ns[1:2, None] / SECOND
         return np.maximum(_peaks(self._coefficients[:1], first), self._rest_peaks)

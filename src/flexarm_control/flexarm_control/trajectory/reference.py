@@ -27,25 +27,26 @@ from .values import (
 GENTLE = 2.0
 #: Minimum duration of that braking, over the period of the lowest bending mode.
 BRAKING_PERIODS = 0.5
-#: Distance that the braking may always take [rad].
+#: Braking may always take this distance [rad].
 BEYOND = 0.02
-#: A start that is farther ahead is taken for a stamp of another clock [ns].
+#: A start that is farther ahead is assumed to be a stamp of another clock [ns].
 FARTHEST_START = 3600 * SECOND
-#: Ratios of a stop's acceleration and jerk to the motion's own largest.
+#: Maximum ratios of a stop's acceleration and jerk to the largest ones of the motion itself.
 MORE = 1.15, 1.3
 #: A motion that is slower than this fraction of what the joint could do is stopped faster than it would stop itself.
 SLOW_FRACTION = 0.2
 #: Minimum duration of a stop, over the period of the lowest bending mode: of a fast motion, and of a slow one.
 PERIODS = 1.2, 1.5
-#: A stop follows a motion to its end, if that is sooner and at most this fraction of the stop's distance farther [-].
+#: A stop follows a motion to its end if the motion ends sooner than the stop, and goes farther than the stop by at most
+#: this fraction of the stop's distance [-].
 FARTHER = 0.2
-#: Number of places of the way beyond at which this is judged; rounding [rad].
+#: Number of places on the remaining way at which this is judged; rounding [rad].
 LOOKS, BEYOND_ROUNDING = 9, 1e-9
 #: Minimum time in which speed scaling changes, or an effort fades [s].
 MIN_RAMP = 0.1
 #: A turn of a continuous joint [rad].
 TURN = 2.0 * np.pi
-#: Ratio of the times that are tried for a stop, and the time law at the places where each is judged.
+#: Ratio of each duration that is tried for a stop to the one before, and the time law at the places where it is judged.
 LONGER, _TABLE = 1.1, Slowing.table(33)[:, :, None]
 
 
@@ -60,7 +61,7 @@ class Verdict:
     reason: str  # why it is refused, or when it starts and which trajectory it replaces
     trajectory_id: int  # counted from 1; of the repeated trajectory for a repeat; 0 if refused
     repeat: bool = False
-    joined: bool = False  # midway: its first points are left out
+    joined: bool = False  # it is joined midway: its first points are left out
 
 
 class ReferenceGenerator:
@@ -154,8 +155,9 @@ class ReferenceGenerator:
         r"""Hold a measured position, or brake from the arm's present motion; earlier trajectories are forgotten.
 
         With a velocity v the reference goes on in its direction from the position, and comes to rest as in `stop`,
-        after :math:`T = \max_j 35 |v_j| / (16 D_j)` and at least half of `period`, v T / 2 farther. That half period
-        does not move any joint out of the range of a trajectory that is given up.
+        v T / 2 farther, after :math:`T = \max_j 35 |v_j| / (16 D_j)`, or half of `period` if that is longer. If half of
+        `period` would move a joint out of the range of the trajectory that is given up, T is shorter, but not shorter
+        than the first value.
 
         Parameters
         ----------
@@ -191,7 +193,7 @@ class ReferenceGenerator:
         self._last_ns = stamp_ns
 
     def _least_braking(self, position, velocity):
-        """Minimum time of `start` for the links' sake [s]; shorter if it led out of the trajectory's range."""
+        """Minimum braking time of `start` that protects the links [s]; shorter if it leads out of the trajectory."""
         least = BRAKING_PERIODS * self._period
         if not (self.active and least > 0.0):
             return least
@@ -230,9 +232,9 @@ class ReferenceGenerator:
     def ahead(self, trajectory):
         """The trajectory as it is followed: continuous joints go the short way; a joined one loses its past points.
 
-        A trajectory that is joined (see `joins`) starts now, with fewer points. An arm that is not on its path, within
-        the tolerance of a start, has at least the lowest mode's period to get there; nearer points are left out, except
-        for the last. If nothing is changed, this is the trajectory itself. Any thread may ask.
+        A trajectory that is joined (see `joins`) starts now, without its past points. If the arm is not on its path
+        within the start tolerance, it has at least the lowest mode's period to get there: earlier points are left out,
+        except for the last one. If nothing changes, this is the trajectory itself. Any thread may ask.
         """
         now, start = self._last_ns, trajectory.stamp_ns
         if now is None or trajectory.joint_names != self.joint_names:
@@ -369,7 +371,7 @@ class ReferenceGenerator:
             self._reference_at(self._path, self._last_ns)
             return
         path = self._path
-        if self._starting is not None:  # as if the next sample were at the last one's stamp
+        if self._starting is not None:  # it is assumed to begin at the last sample's stamp
             self._reference_at(path, self._last_ns)
             path = self._starting
             path.begin(self._last_ns, self._scratch)
@@ -497,7 +499,7 @@ class ReferenceGenerator:
         limits = _limits(path, bound, np.asarray(given, dtype=bool), self._period)
         try:
             duration = _braking_time(path, now, *limits) / SECOND
-        except TrajectoryError:  # it can't be stopped either, but it can go slower
+        except TrajectoryError:  # a stop would fail here, but a slower motion is possible
             duration = MAX_BRAKING
         law = path.law if path.scaled else TimeLaw(now, path.elapsed(now))
         law = law.changed(now, self.speed_scaling, max(duration, MIN_RAMP))
@@ -506,7 +508,7 @@ class ReferenceGenerator:
     def look_at(self, stamp_ns):
         """State (3, n) of the present or coming reference at a stamp `stamp_ns` [ns]; None while there is none.
 
-        An accepted trajectory that waits counts from its start on. The call changes nothing.
+        From its start on, an accepted trajectory that waits gives the state. The call changes nothing.
         """
         if self._last_ns is None:
             return None
@@ -535,9 +537,9 @@ class ReferenceGenerator:
         - otherwise: acceleration and jerk are at most `MORE` times the motion's own largest, or, for a slow motion,
           what slowing down with `SLOW_FRACTION` D takes.
 
-        The bounds hold for every joint. A trajectory that ends before, without a jump, and no more than `FARTHER` of
-        the stop's distance farther, is followed to its end at its own speed. If any other one ends before, the stop's
-        reference ends with it. A stop within a stop only cancels trajectories that wait.
+        The bounds hold for every joint. If the trajectory ends before the stop, without a jump, and no more than
+        `FARTHER` of the stop's distance farther, it is followed to its end at its own speed. Any other trajectory that
+        ends before the stop ends the stop, too. A stop within a stop only cancels trajectories that wait.
 
         Parameters
         ----------
@@ -589,7 +591,7 @@ class ReferenceGenerator:
 
 
 def rest_of(trajectory, now_ns, least):
-    """The points of a trajectory at least a time ahead, or the last one, as a trajectory that starts now.
+    """The points of a trajectory that are at least a time `least` ahead, or its last point, as one that starts now.
 
     Parameters
     ----------
@@ -648,11 +650,11 @@ def _limits(path, deceleration, given, period):
     """Limits of a stop: bounds (n,) of slowing down, acceleration [rad/s^2] and jerk [rad/s^3]; minimum time [s]."""
     speed, acceleration, jerk = path.peaks()
     slow = SLOW_FRACTION * deceleration
-    # How fast the motion itself changes.
+    # Time scale of the motion itself [s].
     scale = np.divide(speed, acceleration, out=np.zeros_like(speed), where=acceleration > 0.0).max()
     low, high = (factor * period for factor in PERIODS)
     shortest = max(min(max(low, 1.2 * scale or np.inf), high), BRAKING_STEP)
-    # What it takes to stop with that deceleration in the shortest time.
+    # Jerk of a stop that has this deceleration and the shortest time.
     with np.errstate(over="ignore"):  # infinite is no bound
         quick = slow * Slowing.MAX_BEND / (Slowing.MAX_SLOPE * shortest)
     bounds = (
@@ -703,5 +705,5 @@ def _braking_time(path, stamp_ns, limits, shortest):
                     value=MAX_BRAKING,
                     hint="give a higher deceleration",
                 )
-            break  # the path itself ends before
+            break  # the path itself ends before that
     return round(time * SECOND)

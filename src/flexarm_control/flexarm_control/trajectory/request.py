@@ -95,9 +95,9 @@ def validate(
         Limits of the positions in the arm's order [rad]; infinite where there is none.
     velocity_max : (n,) array_like, optional
         Limit of the speeds in the arm's order [rad/s]. It applies to the given velocities and to
-        the mean speed between two points, which no curve through both can stay below.
+        the mean speed between two points, since no curve through both can stay below it everywhere.
     held : (n,) array_like, optional
-        Where joints stay that the message leaves out [rad]; if not given, it may leave out none.
+        Positions of joints that the message leaves out [rad]; if not given, it must name all joints.
     streaming : Streaming
         Whether the end may move, how near positions are smoothed, and how effort is treated.
 
@@ -341,13 +341,13 @@ def _lengths(name, column):
 
 def _numbers(name, column, n):
     """Return the values of all points, n each, one after the other, as a flat float array."""
-    # array() rather than numpy: it refuses None and strings, which numpy would convert; and it
-    # copies the array('d') of a ROS message whole.
+    # array() instead of numpy: it refuses None and strings, which numpy would convert; and it
+    # copies the array('d') of a ROS message as a whole.
     numbers = array("d")
     try:
         for values in column:
             numbers.extend(values)
-        if len(numbers) != n * len(column):  # a len() that was wrong
+        if len(numbers) != n * len(column):  # some len() did not fit its sequence
             raise ValueError
     except NOT_NUMBERS:
         raise _unreadable(
@@ -367,7 +367,7 @@ def _unreadable(name, column, convert, problem, hint=""):
 
 
 def _refuse_end_velocity(trajectory):
-    # As the joint_trajectory_controller by default: the hold after the last point has velocity
+    # Like the joint_trajectory_controller by default: the hold after the last point has velocity
     # zero, and a step down to it would excite the links.
     if trajectory.velocities is None:
         return

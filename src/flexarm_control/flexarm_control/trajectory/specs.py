@@ -43,7 +43,7 @@ FAMILIES = {
 }
 REQUIRED = {"line": ("tip",), "arc": ("tip", "via")}
 #: Default number of points of a trajectory. Between them the jerk of the closed forms is right to 1e-6 of its peak.
-#: Where the copies of a shaped quintic begin, with a step of jerk, the acceleration is off by 4e-4.
+#: The copies of a shaped quintic begin with a step of jerk; there the acceleration is off by 4e-4.
 POINTS = 401
 #: Default smoothness of `smooth` and of the time law of tip paths.
 TIP_SMOOTHNESS = 3

@@ -8,17 +8,17 @@ have a velocity. If no other point comes, the motion goes on for the time C (`cm
     \dot q &= v + a t (1 - t/C)^2, && 0 \le t \le C, \\
     \dot q &= v\,(1 - 10x^3 + 15x^4 - 6x^5) + a' B x (1 - x)^3, && x = (t - C)/B,
 
-where v and a are the velocity and acceleration of the last point; a' = 0 after the first part, and a without it.
-Velocity and acceleration have no step, and the jerk has none at the end.
+where v and a are the velocity and acceleration of the last point. a' is 0 after the first part; if C is 0, there is no
+first part, and a' is a. Velocity and acceleration have no step, and the jerk has none at the end.
 
-Positions alone are joined by straight lines, whose velocity steps at each point. If points are nearer to each other
-than a window W, the straight lines L are smoothed by a triangle of that width,
+Points with positions alone are joined by straight lines, whose velocity steps at each point. If points are nearer to
+each other than `smoothing_time`, the straight lines L are smoothed by a triangle of width W,
 
 .. math:: q(t) = \frac{F(t + W/2) - 2F(t) + F(t - W/2)}{(W/2)^2}, \qquad F'' = L .
 
 Its velocity and acceleration are the same differences of F' and of L. The motion reaches the end, at rest, W/2 later. A
-single point is reached at rest after W, if its time is shorter; sent again and again, it acts as a filter of third
-order. W is at least half a period of the lowest bending mode.
+single point is reached at rest, after W if its own time is shorter. A stream of single points is thus filtered with
+third order. W is `smoothing_time`, and at least half a period of the lowest bending mode.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ class Streaming:
     period : float
         Period of the lowest bending mode [s].
     smoothing : float
-        Points that are nearer to each other are smoothed [s]; 0: none.
+        Points that are nearer to each other than this are smoothed [s]; 0: none.
     effort : str
         One of `REFUSE`, `IGNORE` and `ADD`.
     """
@@ -85,7 +85,7 @@ class Streaming:
 
     @property
     def window(self):
-        """W [s]; a slow manifold along a faster motion would not hold."""
+        """W [s]; for a faster motion the slow manifold would not be valid."""
         return max(self.smoothing, SMOOTH_PERIODS * self.period)
 
     def coast(self, velocity):
@@ -95,13 +95,13 @@ class Streaming:
         return Coast(round(self.timeout * SECOND), round(brake * SECOND))
 
 
-#: As a joint_trajectory_controller takes points by default, except for effort.
+#: Treats points like a joint_trajectory_controller by default, except for effort.
 PLAIN = Streaming()
 
 
 @dataclass(frozen=True)
 class Coast:
-    """The end of a motion whose last point moves: it goes on, and comes to rest [ns]."""
+    """The end of a motion whose last point moves: durations for which it goes on, and then brakes [ns]."""
 
     going_on_ns: int
     brake_ns: int
@@ -112,7 +112,7 @@ class Coast:
         return [time for time in (self.going_on_ns, self.brake_ns) if time > 0]
 
     def coefficients(self, position, velocity, acceleration):
-        """Coefficients of its polynomials, each (7, n), from the state at the last point, and the place of rest (n,).
+        """Coefficients of its polynomials, each (7, n), from the state at the last point; and the rest position (n,).
 
         The position is sum_i c_i t^i.
         """

@@ -5,9 +5,9 @@ The torque is that of the slow subsystem (10), the rigid arm with weight, fricti
 
 .. math:: \bar u(t) = B^{-1}(q_r, \dot q_r)\,[\ddot q_r - a(q_r, \dot q_r)] .
 
-It is evaluated at places of every polynomial, at its ends from inside, and for the hold after the last point. Steps of
-the velocity, as between positions alone, have no finite torque. They are left to the tracking, and the rest is judged.
-Torque for the bending is left to the fast control.
+It is evaluated at several places of every polynomial, including both of its ends, and for the hold after the last
+point. Steps of the velocity, as between points with positions alone, have no finite torque. They are not judged; the
+tracking has to deal with them. Torque for the bending is not judged either; it is left to the fast control.
 """
 
 import numpy as np
@@ -18,9 +18,9 @@ from flexarm_dynamics.singular_perturbation import slow_torque
 from .path import Path
 from .values import SECOND, TORQUE_ROUNDING
 
-#: Number of places per polynomial; with the maximum, a peak between them is right to half a percent.
+#: Number of places per polynomial; with the maximum, a peak between places is missed by at most half a percent.
 MIN_PLACES, MAX_PLACES = 2, 33
-#: Approximate number of places in all, as long as there are few polynomials; and maximum number.
+#: Approximate number of places of all polynomials together, if there are few polynomials; and maximum number.
 PLACES, MOST = 400, 2000
 
 
@@ -85,13 +85,13 @@ def _effort(path, times, n):
 
 
 def _places(path, from_start):
-    """Point that each judged polynomial leads to, time from the start [s], and state (k, 3, n)."""
+    """Of each judged place: point that its polynomial leads to, time from the start [s], and state, (k, 3, n)."""
     points = len(path.lengths)
     kept = np.arange(0 if from_start else 1, points)
     kept = kept[path.lengths[kept] > 0.0]
     each = int(np.clip(PLACES // max(kept.size, 1), MIN_PLACES, MAX_PLACES))
     if kept.size * each > MOST:
-        # Evenly, and where each joint accelerates most.
+        # Keep polynomials at even intervals, and those in which each joint accelerates most.
         ends = np.abs(path.at_places(kept, np.array([0.0, 1.0]))[..., 2, :]).max(axis=1)
         even = np.linspace(0, kept.size - 1, MOST // each).astype(int)
         kept = kept[np.union1d(even, np.argmax(ends, axis=0))]
@@ -109,7 +109,7 @@ def _places(path, from_start):
 
 
 def _hint(model, state, needed, limit):
-    """What to do: slower, if the arm can be held there; torques of a motion fall with its time squared."""
+    """What to do: move more slowly, if the arm can be held there; a motion's torque falls as one over time squared."""
     still = required_torque(model, (state * [[1.0], [0.0], [0.0]])[None])[0]
     if not (np.abs(still) < limit).all():
         return "the arm can't be held there: choose other positions"

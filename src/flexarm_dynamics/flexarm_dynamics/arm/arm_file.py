@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads arm files (YAML) and validates them; every error names its field by its path, such as ``links[0].length``.
 
-A file gives an `Arm` or an `ArmFileError`, never half an arm.
+A file gives an `Arm` or an `ArmFileError`, never an incomplete arm.
 """
 
 import math
@@ -38,7 +38,7 @@ from .description import (
 from .entries import MAX_NUMBER, Section, kind_of, read_yaml, value_error
 
 JOINT_TYPES = ("revolute", "fixed")
-#: Max. number of parts of a link that has `sections`.
+#: Max. number of entries in a link's `sections`.
 MAX_SECTIONS = 40
 #: Largest resolution of a gauge's bridge [bit].
 MAX_BITS = 32
@@ -221,7 +221,7 @@ def _flexibility(s):
 STIFFNESS_KEYS = ("EI_y", "EI_z", "GJ")
 #: Keys that a part of a link inherits from the part before it, unless it states its own.
 INHERITED = ("shape", "density", "youngs_modulus", "shear_modulus")
-#: Where the properties of a tapered section are computed, from one end to the other [-].
+#: Places, from one end (0) to the other (1), where the properties of a tapered section are computed [-].
 _TAPER = 0.5 - 0.5 * np.cos(np.pi * np.arange(9) / 8.0)
 
 
@@ -235,7 +235,7 @@ class _Part:
 
 
 def _ends(s, key, dimension, default=None, low=None):
-    """A number, or one for each end of a tapered part, as a polynomial: one or two coefficients."""
+    """A number, or one for each end of a tapered part, as a polynomial with one or two coefficients."""
     if isinstance(s.raw(key), list):
         pair = s.vector(key, 2, dimension)
         for value in pair:
@@ -289,7 +289,7 @@ def _along(coefficients):
 def _rectangle(b, h):
     """Area, second moments and torsion constant of a rectangle of sizes b along y, h along z."""
     wide, thin = np.maximum(b, h), np.minimum(b, h)
-    # Roark, torsion constant of a rectangle, within 0.5 %.
+    # Roark's torsion constant of a rectangle, accurate within 0.5 %.
     ratio = thin / wide
     torsion = wide * thin**3 * (1.0 / 3.0 - 0.21 * ratio * (1.0 - ratio**4 / 12.0))
     return b * h, h * b**3 / 12.0, b * h**3 / 12.0, torsion
@@ -304,7 +304,7 @@ def _tube(outer, wall):
 
 
 def _numbers(s, taper):
-    """Properties given as numbers; with `taper` they may differ from end to end."""
+    """Properties given as numbers; with `taper`, the two ends may differ."""
 
     def read(key, dimension, default=None, low=None):
         if taper:
@@ -484,7 +484,7 @@ def _body(s, length):
 
 
 def _tensor(s, key):
-    """Rows of an inertia, given as one number for every axis or as xx, yy, zz, xy, xz, yz; zero if it is not given."""
+    """Rows of an inertia; the file has one number for all axes, or xx, yy, zz, xy, xz, yz, or nothing for zero."""
     inertia = np.zeros((3, 3))
     if s.has(key):
         if isinstance(s.raw(key), list):
@@ -607,7 +607,7 @@ def _observed(s, modes, gauges):
                 f"{seen_by} on {key[0]} in direction {key[1]} for {wanted} observed modes",
                 hint="add gauges or list fewer observed_modes",
             )
-    # The modal coordinates keep the arm's order, whatever the order in the file.
+    # In the arm's order of modes, whatever the order in the file.
     return tuple(m.name for m in modes if m.name in names)
 
 
@@ -667,10 +667,10 @@ def parse(text, where="arm", folder=None):
         description=top.text("description", ""),
         source=top.text("source", ""),
     )
-    # Misspelt fields first: a misspelt observed_modes would be taken for too few gauges.
+    # Refuse misspelt fields first: a misspelt observed_modes would otherwise be reported as too few gauges.
     top.has("observed_modes")
     top.done()
-    bending = [m for m in arm.modes if m.direction != TRANSMISSION]  # what gauges can see
+    bending = [m for m in arm.modes if m.direction != TRANSMISSION]  # gauges measure only these
     return replace(arm, observed_modes=_observed(top, bending, gauges))
 
 
@@ -695,7 +695,7 @@ def _model(top):
 
 
 def arms_directories():
-    """Folders that are searched for shipped arms: the source tree first, then what colcon installed."""
+    """Folders that are searched for shipped arms: first the source tree, then the folders that colcon installed."""
     here = Path(__file__).resolve()
     places = [parent / "config" / "arms" for parent in here.parents]
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
@@ -710,13 +710,13 @@ def find(name):
     Raises
     ------
     ArmFileError
-        When there is no such file; lists the shipped names.
+        If there is no such file; the message lists the shipped names.
     """
     try:
         path = Path(name).expanduser()
         if path.is_file():
             return path
-    except (OSError, RuntimeError) as error:  # a name too long; no such user's home
+    except (OSError, RuntimeError) as error:  # too long a name, or the home of an unknown user
         raise ArmFileError("arm", f"{str(name)[:80]!r} is no path: {error}") from None
     for directory in arms_directories():
         candidate = directory / f"{name}.yaml"

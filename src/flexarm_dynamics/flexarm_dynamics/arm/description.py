@@ -17,7 +17,7 @@ from ..errors import ModelError
 from .reduced import DIRECTION as REDUCED
 from .reduced import Reduced
 
-#: Directions in which a beam is flexible, and all directions: links given by reduced matrices have one of their own.
+#: Directions in which a beam is flexible, and all directions: links given by reduced matrices have their own.
 BEAM_DIRECTIONS = ("y", "z", "twist")
 DIRECTIONS = (*BEAM_DIRECTIONS, REDUCED)
 ENCODERS = ("motor", "link")
@@ -33,14 +33,14 @@ class Friction:
 
     .. math:: f_v\dot q + \bigl(f_c + (f_b - f_c)e^{-(\dot q/v_s)^2} + c\,|\tau|\bigr)\tanh(\dot q/v_0)
 
-    with the torque tau that the transmission transmits. A breakaway level below the Coulomb level has no effect.
+    where tau is the torque that the transmission transmits. A breakaway level below the Coulomb level has no effect.
     """
 
     viscous: float = 0.0  # [N m s/rad] f_v
     coulomb: float = 0.0  # [N m] f_c
     smoothing: float = 0.01  # [rad/s] v_0: speed at which Coulomb friction reaches 76 %
     breakaway: float = 0.0  # [N m] f_b: level at rest
-    stribeck: float = 0.1  # [rad/s] v_s: speed at which 37 % of the excess over Coulomb is left
+    stribeck: float = 0.1  # [rad/s] v_s: speed at which 37 % of the excess over Coulomb remains
     load: float = (
         0.0  # [-] c: fraction of the transmitted torque that is friction; only with a transmission
     )
@@ -99,25 +99,25 @@ class Joint:
     origin_xyz: tuple = (0.0, 0.0, 0.0)  # [m] from the previous link's tip
     origin_rpy: tuple = (0.0, 0.0, 0.0)  # [rad] roll, pitch, yaw, as in URDF
     hub_inertia: float = 0.0  # [kg m^2] about the axis, turns with the link
-    motor_mass: float = 0.0  # [kg] at the joint, hangs on the previous link
+    motor_mass: float = 0.0  # [kg] at the joint, moves with the previous link
     housing_inertia: tuple = (
         (0.0,) * 3,
-    ) * 3  # [kg m^2] of the motor about the joint, before its turn
+    ) * 3  # [kg m^2] of the motor about the joint, in the joint's frame at angle zero
     rotor_inertia: float = 0.0  # [kg m^2] motor side
     gear_ratio: float = 1.0  # [-] motor turns per joint turn
     friction: Friction = Friction()
     limits: Limits = Limits()
     safe_action: str = "damp"
     brake_torque: float | None = None  # [N m] holding capacity; None: the torque limit
-    damp_coefficient: float | None = None  # [N m s/rad], without a bound; None: a bounded torque
+    damp_coefficient: float | None = None  # [N m s/rad], no torque limit; None: limited torque
     damp_torque: float | None = None  # [N m] limit of damp; None: from limits, gauges and weight
-    damp_time: float | None = None  # [s] of its soft start; None: half a period, at most 0.25
+    damp_time: float | None = None  # [s] of damp's soft start; None: half a period, at most 0.25
     encoder_counts: int = 0  # [-] per turn of the joint; 0: not quantised
     encoder: str = (
-        "motor"  # what it measures: the motor's angle, or the link's behind the transmission
+        "motor"  # what it measures: the angle of the motor, or of the link behind the transmission
     )
     transmission: Transmission | None = None  # None: the link is fixed to the motor
-    continuous: bool = False  # turns without end: a trajectory takes the shorter way
+    continuous: bool = False  # may turn without end: a trajectory takes the shorter way
 
     @property
     def housed(self):
@@ -142,13 +142,13 @@ class Flexibility:
 
 @dataclass(frozen=True)
 class Piece:
-    r"""A part of a link over which its section changes gradually, or not at all.
+    r"""A part of a link over which its section changes gradually or is constant.
 
     Each property is a polynomial in :math:`t = (\xi - start)/(end - start)`, lowest power first, relative to the link's
     own value (mass per length, stiffness or polar inertia per length).
     """
 
-    start: float  # [-] xi at its end towards the base
+    start: float  # [-] xi at the end nearer to the base
     end: float  # [-]
     mass: tuple = (1.0,)
     y: tuple = (1.0,)
@@ -169,7 +169,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Link:
-    """A link along x; rigid in directions that `flexible` does not have, uniform if it has no `pieces`."""
+    """A link along x; rigid in directions that are not in `flexible`, uniform if it is a beam without `pieces`."""
 
     name: str
     length: float  # [m]
@@ -191,12 +191,12 @@ class Link:
         return np.array([self.length, 0.0, 0.0])
 
     def available(self, count):
-        """The number of modes `count`, or as many as its matrices have, if fewer."""
+        """The number of modes `count`, or the number of modes of its matrices if that is lower."""
         return count if self.reduced is None else min(count, self.reduced.modes)
 
     @property
     def uniform(self):
-        """Whether it is a beam of one section."""
+        """Whether it is a beam with the same section everywhere."""
         return not self.pieces and self.reduced is None
 
     @property
@@ -259,7 +259,7 @@ class Link:
         Parameters
         ----------
         low, high : float
-            From the link's base; without `high` to its tip [m].
+            Distance from the link's base; the tip if `high` is not given [m].
 
         Returns
         -------
@@ -279,7 +279,7 @@ class Link:
             mass, first, second = (self.mass_per_length * p for p in powers)
             return mass, first, second, self.polar_inertia_per_length * (high - low)
         sums = np.zeros(4)
-        points, weights = np.polynomial.legendre.leggauss(8)  # exact: polynomials
+        points, weights = np.polynomial.legendre.leggauss(8)  # exact to degree 15
         for a, b in pairwise(np.clip(np.array(self.breaks) * self.length, low, high)):
             x = a + 0.5 * (b - a) * (points + 1.0)
             w = 0.5 * (b - a) * weights
@@ -311,14 +311,14 @@ class Gauge:
     link: str
     position: float  # [m] from the link's base
     direction: str
-    surface_distance: float  # [m] from the neutral axis; its sign tells the face
+    surface_distance: float  # [m] from the neutral axis; its sign gives the face
     gain: float = 1.0  # [-]
     bias: float = 0.0  # [-] strain
     noise: float = 0.0  # [-] rms strain
-    bits: int = 0  # [-] of the bridge's converter over full scale; 0: not quantised
-    full_scale: float = 1000e-6  # [-] strain, the range's end on either side
+    bits: int = 0  # [-] of the bridge's converter, from -full_scale to full_scale; 0: not quantised
+    full_scale: float = 1000e-6  # [-] strain at both ends of the range, without sign
     drift: float = 0.0  # [1/sqrt(s)] strain: rms change of the bias over a second, a random walk
-    point: str = ""  # on a link given by reduced matrices: its place, by the archive's name
+    point: str = ""  # on a link given by reduced matrices: the archive's name of its place
 
     @property
     def step(self):
@@ -327,7 +327,7 @@ class Gauge:
 
     @property
     def range(self):
-        """Least and greatest reading [-]; a converter's counts end one short of +full_scale."""
+        """Lowest and highest reading [-]; a converter's highest count is one step below +full_scale."""
         return -self.full_scale, self.full_scale - self.step
 
     @property
@@ -342,7 +342,7 @@ TRANSMISSION = "transmission"
 
 @dataclass(frozen=True)
 class Mode:
-    """What a modal coordinate describes: its link (for a transmission: its joint), direction and number (from 1)."""
+    """A modal coordinate: its link (for a transmission: its joint), direction and number (from 1)."""
 
     link: str
     direction: str
@@ -365,16 +365,16 @@ class Arm:
     links: tuple
     payload: Payload = Payload()
     gauges: tuple = ()
-    observed_modes: tuple = ()  # names; all of the arm's modes unless the file says otherwise
+    observed_modes: tuple = ()  # names; all modes of the arm's links unless the file states them
     gravity: tuple = (0.0, 0.0, 0.0)  # [m/s^2] in the base frame
-    foreshortening: bool = False  # links keep their length: stiffer when spun
-    finite_slope: bool = False  # and their curvature and tips' angles hold for large slopes
+    foreshortening: bool = False  # links keep their length, so they are stiffer when they spin
+    finite_slope: bool = False  # curvature and tip angles are correct for large slopes, too
     model: str = "chain"  # name of the model class, found through entry points
-    model_options: dict = field(default_factory=dict)  # what that class alone understands, SI
+    model_options: dict = field(default_factory=dict)  # options of that class only, SI
     description: str = ""
     source: str = ""
     simplifies: "Arm | None" = (
-        None  # the actual arm, if this one is what a controller knows of it, see `known`
+        None  # the actual arm, if this one is how a controller knows it, see `known`
     )
 
     @property
@@ -390,7 +390,7 @@ class Arm:
 
     @property
     def whole(self):
-        """The actual arm with its transmissions, also if this one is what is `known` of it."""
+        """The actual arm with its transmissions, even if this one is the `known` arm."""
         return self if self.simplifies is None else self.simplifies
 
     @property
@@ -431,7 +431,7 @@ class Arm:
 
     @property
     def position_limits(self):
-        """Least and largest position of each joint, (n, 2) [rad]; infinite where the file has none."""
+        """Lowest and highest position of each joint, (n, 2) [rad]; infinite where the file has none."""
         return np.array([j.limits.position for j in self.joints], float)
 
     @property
@@ -446,7 +446,7 @@ class Arm:
 
     @property
     def continuous(self):
-        """Whether each joint turns without an end, (n,) bool."""
+        """Whether each joint may turn without end, (n,) bool."""
         return np.array([j.continuous for j in self.joints], bool)
 
     @property
@@ -471,8 +471,8 @@ class Arm:
     def with_modes(self, count):
         """The same arm with `count` modes in every flexible direction of every link.
 
-        Gauges and observed modes stay as they are. The modes that the controller does not know strain the gauges, too:
-        this is spill-over.
+        Gauges stay as they are, and so do observed modes that the arm still has. Modes that the controller does not
+        know strain the gauges, too: this is spill-over.
         """
         if self.simplifies is not None:
             return self.simplifies.with_modes(count).known
@@ -516,10 +516,9 @@ class Arm:
 
 
 def scaled(arm, payload=1.0, stiffness=1.0, damping=1.0):
-    """The same arm with another payload, stiffness or damping, as a controller designed for the first one may meet it.
+    """The same arm with another payload, stiffness or damping: for tests of a controller designed for the original.
 
-    Gauges, observed modes and everything else stay. Where mode shapes depend on the payload (`loaded`), they
-    change with it.
+    Gauges, observed modes and everything else stay. Mode shapes that depend on the payload (`loaded`) change with it.
 
     Parameters
     ----------

@@ -14,12 +14,12 @@ from ..errors import ArmFileError
 from ..shown import number, show
 from .units import SI_UNIT, to_si
 
-#: Largest number in a file, in SI; powers and products of smaller ones are finite.
+#: Largest number in a file; powers and products of smaller ones are finite.
 MAX_NUMBER = 1e30
 
 
 def read_yaml(text, where):
-    """The text of the file `where` as dicts, lists and scalars; refuses a key that is given twice."""
+    """The `text` of the file `where` as dicts, lists and scalars; refuses a key that is given twice."""
     try:
         loader = yaml.SafeLoader(text)
         root = loader.get_single_node()
@@ -85,7 +85,7 @@ class Section:
         self.read = set()
 
     def at(self, key):
-        """Path of one of its entries, by its `key`."""
+        """Path of the entry `key`."""
         name = number(key) if isinstance(key, str) else show(key)
         return f"{self.path}.{name}" if self.path else name
 
@@ -191,7 +191,7 @@ class Section:
 
 
 def _meant(name, known):
-    """A hint at the known name that is spelt like this one."""
+    """A hint with the known name that is spelt most like this one."""
     close = difflib.get_close_matches(name, known, 1)
     return f"did you mean {close[0]!r}?" if close else ""
 
@@ -216,7 +216,7 @@ def kind_of(value):
 
 def _number(value, path):
     if isinstance(value, str):
-        # YAML 1.1 takes 1e-3 (no dot) for text; the user means the number.
+        # YAML 1.1 reads 1e-3 (no dot) as text, but the user means the number.
         try:
             value = float(value)
         except ValueError:

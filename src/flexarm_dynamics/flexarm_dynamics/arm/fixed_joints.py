@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Removes fixed joints: the two links that a fixed joint holds together become one, before anything is computed.
 
-A rigid link before a fixed joint becomes a body at the root of the link after it; the axis of that link then begins off
-its joint. A rigid link after a fixed joint, behind a link that bends, becomes a body at the tip of that link. The next
-joint moves with it.
+A rigid link before a fixed joint becomes a body at the root of the link after it; the axis of that link then
+begins away from its joint. A rigid link after a fixed joint, behind a link that bends, becomes a body at the tip of
+that link. The next joint moves with it.
 """
 
 from dataclasses import replace

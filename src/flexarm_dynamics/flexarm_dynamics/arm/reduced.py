@@ -2,11 +2,10 @@
 r"""Reads links given by reduced matrices, which finite-element programs export, from a NumPy archive of named arrays.
 
 A point that is at x in the undeformed link is at :math:`x + \Phi_j(x)\delta_j + \tfrac12\Psi_{jk}(x)\delta_j\delta_k`.
-The shapes :math:`\Phi_j` vanish, with their slopes, at the root. :math:`\Psi_{jk}` may be left out; it describes how
-the link draws back as it bends, and gives the geometric stiffness: under an acceleration a the stiffness gains
-:math:`a\cdot\int\Psi_{jk}dm`, under a force f at the tip :math:`-f\cdot\Psi_{jk}`. All arrays are in SI and in the
-link's frame, whose origin is the root. The K modes may be of any kind (Craig-Bampton, normal, static) and need not be
-orthogonal.
+The shapes :math:`\Phi_j` and their slopes are zero at the root. :math:`\Psi_{jk}` may be left out; it describes the
+foreshortening of the bent link, and gives the geometric stiffness: an acceleration a adds :math:`a\cdot\int\Psi_{jk}dm`
+to the stiffness, a force f at the tip adds :math:`-f\cdot\Psi_{jk}`. All arrays are in SI and in the link's frame,
+whose origin is the root. The K modes may be of any kind (Craig-Bampton, normal, static) and need not be orthogonal.
 
 Shabana (2020), Dynamics of Multibody Systems, 5th ed., ch. 5 (the shape integrals); Craig & Bampton (1968), AIAA
 Journal 6(7).
@@ -40,7 +39,7 @@ ARRAYS = {
     "tip_translation": (("K", 3), "Phi_j there"),
     "tip_rotation": (("K", 3), "rotation vector of the tip"),
 }
-#: Arrays that may be left out: zero then, or none.
+#: Arrays that may be left out; they are then zero or not used.
 OPTIONAL = {
     "modal_damping": (("K", "K"), "instead of the arm file's damping ratios"),
     "second_translation": (("K", "K", 3), "int Psi_jk dm"),
@@ -55,7 +54,7 @@ OPTIONAL = {
 }
 #: Largest asymmetry of the modal matrices, relative to their largest entry [-].
 ASYMMETRY = 1e-6
-#: Tip displacement of a mode whose amplitude is one, at most [m]: about that of a beam's modes.
+#: Displacement of a mode with amplitude one where it is largest, over tip and stations [m]: about that of beam modes.
 SCALE = 2.0
 
 
@@ -90,7 +89,7 @@ class Reduced:
 
     @property
     def stiffens(self):
-        """Whether it knows how the link draws back as it bends."""
+        """Whether its arrays include the foreshortening of the bent link."""
         return "second_translation" in self.arrays
 
     def get(self, name):
@@ -105,7 +104,7 @@ class Reduced:
         Parameters
         ----------
         mass : float
-            Of the body [kg].
+            Mass of the body [kg].
         moment : ndarray, shape (3,)
             Its first moment from the tip [kg m].
         inertia : ndarray, shape (3, 3)
@@ -116,7 +115,7 @@ class Reduced:
         return _in_modes(self.arrays, self.carrying(mass, moment, inertia), count)
 
     def carrying(self, mass, moment, inertia):
-        """Modal mass with a rigid body at the tip, (K, K), given as for `loaded`."""
+        """Modal mass with a rigid body at the tip, (K, K); arguments as for `loaded`."""
         T, R = self["tip_translation"], self["tip_rotation"]
         cross = T @ np.cross(R, moment).T
         return self["modal_mass"] + mass * T @ T.T + R @ inertia @ R.T + cross + cross.T
@@ -177,7 +176,7 @@ def read(path, where):
     ----------
     path : Path
     where : str
-        The arm file's field that names it.
+        Field of the arm file that names the archive.
 
     Returns
     -------
@@ -316,7 +315,7 @@ def _symmetric(value, where):
 
 
 def _check_mass(a, where):
-    """Refuse masses that no body has: the kinetic energy of any motion is positive."""
+    """Refuse masses that no body can have: the kinetic energy of any motion must be positive."""
     c, K = a["first_moment"], len(a["translation"])
     cross = np.array([[0.0, -c[2], c[1]], [c[2], 0.0, -c[0]], [-c[1], c[0], 0.0]])
     M = np.zeros((6 + K, 6 + K))

@@ -2,8 +2,8 @@
 r"""Computes the frames of the sections of bent and twisted links, for pictures and for the rigid pieces of a URDF.
 
 A section at x of a link has the frame that the link's tip would have if the link ended there. It always comes from the
-chain model (`chain`), since the models of one link have the same mode shapes. What does not change with the motion is
-prepared once; an evaluation then takes some 20 us per section.
+chain model (`chain`), since the models of one link have the same mode shapes. The data that do not change with the
+motion are prepared once; an evaluation then takes about 20 us per section.
 """
 
 from dataclasses import replace
@@ -22,13 +22,13 @@ class Sections:
     count : int
         Spaces between the sections of a flexible link; a rigid one has its two ends.
     linear : bool
-        True: displacements are linear in the deflections, whatever the arm's level. This is for deflections that are
-        exaggerated beyond what a link of constant length can do.
+        True: displacements are linear in the deflections, whatever the arm's level. This is for exaggerated
+        deflections, which may be larger than a link of constant length allows.
 
     Attributes
     ----------
     positions : list of (k,) ndarray
-        Of each link's sections, from its base [m].
+        Positions of each link's sections from its base [m].
     """
 
     def __init__(self, model, count=16, linear=False):
@@ -52,7 +52,7 @@ class Sections:
         q : (n,) array_like
             [rad]
         delta : (m,) array_like, optional
-            Modal amplitudes, bending [m], twist [rad]; none: the straight arm.
+            Modal amplitudes, bending [m], twist [rad]; not given: the straight arm.
 
         Returns
         -------
@@ -86,7 +86,7 @@ def chain_of(model, linear=False):
     ----------
     model : ArmModel
     linear : bool
-        Whether displacements are to be linear in the deflections.
+        Whether displacements must be linear in the deflections.
 
     Returns
     -------

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Maps strains to modal amplitudes and back.
 
-A gauge at :math:`\eta` on a face at distance c from the neutral axis reads, for bending,
+For bending, a gauge at :math:`\eta` on a face at distance c from the neutral axis reads
 
 .. math:: \varepsilon = -c\,y''(\eta) = -\frac{c}{L^2}\sum_i\phi_i''(\eta/L)\,\delta_i
 
 (tension positive: a beam bent towards +y is compressed on its +y face), and for twist
-:math:`\gamma = c\,\theta'(\eta)`. The rows R of all gauges give strain = gain * R delta + bias; the map back is
-weighted least squares, with weights of one over the noise variance:
+:math:`\gamma = c\,\theta'(\eta)`. The rows R of all gauges give strain = gain * R delta + bias. The inverse map is
+weighted least squares; each weight is one over the noise variance:
 
 .. math:: \hat\delta = (R_o^T W R_o)^{-1} R_o^T W\,(\varepsilon - b)
 
-with the gains in the rows. The variance of a reading is that of its noise, plus step^2/12 if the bridge rounds to
+where the rows include the gains. The variance of a reading is that of its noise, plus step^2/12 if the bridge rounds to
 steps. The errors of different gauges are independent, so the amplitudes have the covariance :math:`(R_o^T W R_o)^{-1}`.
-Modes that the arm has but does not observe leak into the estimate by :math:`R_o^+R_u\delta_u`: spill-over.
+Modes that are not observed change the estimate by :math:`R_o^+R_u\delta_u`: spill-over.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from ..errors import ModelError, check_shape
 
 
 def gauge_rows(model, gauges, mode_names=None):
-    """Rows R with strain = R delta, gains and biases aside.
+    """Rows R with strain = R delta, without gains and biases.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def gauge_rows(model, gauges, mode_names=None):
 
 
 def reading_rows(model, gauges, mode_names=None):
-    """As `gauge_rows`, times the gain of each gauge: what the gauges read, biases aside."""
+    """As `gauge_rows`, times the gain of each gauge: they give the readings without biases."""
     gains = np.array([gauge.gain for gauge in gauges], float)
     return gains[:, None] * gauge_rows(model, gauges, mode_names)
 
@@ -66,8 +66,8 @@ def reading_rows(model, gauges, mode_names=None):
 def reading_noise(gauges):
     """Rms error of each gauge's reading for the weights, shape (gauges,) [strain], and whether any gauge states it.
 
-    A gauge without a stated noise has the weight of the quietest gauge that states one. If none does, all weights are
-    equal.
+    A gauge that states neither noise nor bits has the weight of the most accurate gauge that does. If none does, all
+    weights are equal.
     """
     noise = np.array([g.uncertainty for g in gauges])
     stated = noise > 0.0
@@ -77,8 +77,7 @@ def reading_noise(gauges):
 def confused(rows, mode_names):
     """Modes that gauges with these rows can't tell apart.
 
-    Each column is first scaled to unit norm. So the difference between the patterns of strain counts, and not that a
-    higher mode strains more.
+    Each column is first scaled to unit norm. So only the pattern of strain counts, not that a higher mode strains more.
 
     Parameters
     ----------
@@ -91,7 +90,7 @@ def confused(rows, mode_names):
     unseen : tuple of str
         Modes that strain no gauge.
     alike : tuple of str
-        Modes of which a combination strains no gauge; empty if there is none.
+        Modes that can combine so that they strain no gauge; empty if there are none.
     """
     size = np.linalg.norm(rows, axis=0)
     seen = size > size.max(initial=0.0) / StrainMap.WORST_CONDITION
@@ -99,7 +98,7 @@ def confused(rows, mode_names):
     names = [n for n, s in zip(mode_names, seen, strict=True) if s]
     if not names:
         return unseen, ()
-    # Rows of zeros below make the null space complete if there are fewer gauges than modes.
+    # If there are fewer gauges than modes, rows of zeros are needed to get the whole null space.
     scaled = np.vstack([rows[:, seen] / size[seen], np.zeros((len(names), len(names)))])
     _, values, directions = np.linalg.svd(scaled)
     null = directions[values < values[0] / StrainMap.WORST_CONDITION]
@@ -118,11 +117,11 @@ class StrainMap:
     Attributes
     ----------
     gauge_names, mode_names : tuple of str
-        Order of strains in and amplitudes out.
+        Order of the strains (input) and of the amplitudes (output).
     rows : ndarray, shape (gauges, modes)
         R_o, gain included.
     noise : ndarray, shape (gauges,)
-        Rms error of a reading on which the weights are based [strain]; 1 where no gauge states one.
+        Rms error of a reading on which the weights are based [strain]; 1 if no gauge states one.
     noise_stated : bool
         Whether any gauge states one.
     inverse : ndarray, shape (modes, gauges)
@@ -131,7 +130,7 @@ class StrainMap:
         Condition number of the weighted rows.
     """
 
-    #: Above this the gauges can't tell the modes apart, and noise hides the amplitudes.
+    #: Condition number above which the gauges can't tell the modes apart, and noise hides the amplitudes.
     WORST_CONDITION = 1e6
     #: Number of sets of lost gauges for which inverses are kept.
     KEPT = 256
@@ -177,7 +176,7 @@ class StrainMap:
 
     @property
     def amplitude_noise(self):
-        """Rms noise of each amplitude, shape (modes,) [m, rad]; NaN where no gauge states its own."""
+        """Rms noise of each amplitude, shape (modes,) [m, rad]; NaN if no gauge states its own."""
         if not self.noise_stated:
             return np.full(len(self.mode_names), np.nan)
         return np.linalg.norm(self.inverse * self.noise, axis=1)
@@ -193,7 +192,7 @@ class StrainMap:
         return self.inverse_without(lost) is not None
 
     def amplitudes_without(self, lost, strain, out=None):
-        """Modal amplitudes from the other gauges alone; the lost ones' strains may be anything.
+        """Modal amplitudes from the other gauges only; strains of lost gauges may have any value.
 
         Parameters
         ----------
@@ -201,7 +200,7 @@ class StrainMap:
             Indices of gauges, ascending, for which `possible_without` holds.
         strain : ndarray, shape (gauges,)
         out : ndarray, shape (modes,), optional
-            Written and returned, where given.
+            Written and returned if given.
 
         Returns
         -------
@@ -214,7 +213,7 @@ class StrainMap:
         return np.dot(self.inverse_without(lost), difference, out=out)
 
     def inverse_without(self, lost):
-        """`inverse` of the gauges that are not in `lost`, with zeros for the others; None where they don't suffice.
+        """`inverse` of the gauges that are not in `lost`, with zeros for the others; None if they don't suffice.
 
         The inverse for each single loss is prepared at the start. The inverse for several losses is computed when they
         first occur, in about 0.1 ms, and kept.

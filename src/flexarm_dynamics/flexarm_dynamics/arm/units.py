@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Converts to SI, once on reading; everything inside is SI.
 
-A dimension is written as powers of (force, length, time); imperial means ft, lbf, s, so that mass is
-lbf s^2/ft (slug) and inertia lbf ft s^2.
+A dimension is written as powers of force and length; time is in seconds in both systems. Imperial means ft, lbf, s, so
+mass is in lbf s^2/ft (slug) and inertia in lbf ft s^2.
 """
 
 FOOT = 0.3048  # [m], exact

@@ -11,11 +11,11 @@ from that of a beam of constant length with the tangent t. At the level `first_o
 :math:`\tfrac12\int y'^2 dx`. Rigid pieces do not, so this difference remains.
 
 Where two pieces meet there is one revolute joint for each way in which the link is flexible: about z for bending along
-y, about y for bending along z, about x for twist, in this order. Each joint's angle corrects what is left of the
-rotation from the chain so far to the wanted section, so errors do not add up along the link.
+y, about y for bending along z, about x for twist, in this order. The angles are found from the rotation between the end
+of the chain so far and the wanted section, so errors do not add up along the link.
 
-It is for display (RViz, robot_state_publisher, Foxglove). The small joints have no springs, so a simulation of this
-URDF does not behave like the arm. Rotors behind gears and the first motor, which does not move, are left out.
+The URDF is for display (RViz, robot_state_publisher, Foxglove). The small joints have no springs, so a simulation of
+this URDF does not behave like the arm. Rotors behind gears and the first motor, which does not move, are left out.
 """
 
 import xml.etree.ElementTree as ET
@@ -27,7 +27,7 @@ from ..errors import ModelError
 from ..models.model import about_axis, rotation
 from .sections import Sections
 
-#: Axis of the small joint for each direction, in the order of the turns Rz Ry Rx.
+#: Axis of the small joint for each direction, in the order of the rotations Rz Ry Rx.
 AXES = {"y": (0.0, 0.0, 1.0), "z": (0.0, 1.0, 0.0), "twist": (1.0, 0.0, 0.0)}
 #: Radius of a link as it is drawn, relative to the length of all links [-].
 THICKNESS = 0.01
@@ -37,14 +37,14 @@ BEND = 1.5
 
 @dataclass(frozen=True)
 class Junction:
-    """Where a piece begins: its small joints' names by direction."""
+    """The small joints where a piece begins: their names by direction."""
 
     link: str
     joints: dict
 
 
 class PieceChain:
-    """An arm's URDF and the joint values that put it where the arm is.
+    """The URDF of an arm, and the joint values that give it the arm's shape.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class PieceChain:
     Raises
     ------
     ModelError
-        For no piece at all, or two parts of the same name.
+        If `pieces` is below 1, or if two parts have the same name.
     """
 
     def __init__(self, model, pieces=8):
@@ -92,12 +92,12 @@ class PieceChain:
         q : (n,) array_like
             [rad]
         delta : (m,) array_like, optional
-            Modal amplitudes [m, rad]; none: the straight arm.
+            Modal amplitudes [m, rad]; not given: the straight arm.
 
         Returns
         -------
         ndarray, shape (len(joint_names),)
-            [rad], in the order of `joint_names`; the same array at each call.
+            [rad], in the order of `joint_names`; each call overwrites and returns the same array.
 
         Raises
         ------
@@ -121,7 +121,7 @@ class PieceChain:
 
 
 def angles(turn, directions):
-    """Angles about z, y and x that make up a rotation, for those axes that have a joint.
+    """Angles about z, y and x that together give a rotation, for those axes that have a joint.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ class _Writer:
         return '<?xml version="1.0"?>\n' + ET.tostring(self.root, encoding="unicode") + "\n"
 
     def _arm_link(self, i, link, parent):
-        """A joint of the arm and the link behind it; the name of its tip's frame."""
+        """Write a joint of the arm and the link behind it; returns the name of its tip's frame."""
         joint = self.arm.joints[i]
         self._joint(joint.name, parent, link.name, joint.axis, joint.origin_xyz, joint.origin_rpy)
         self._limits(joint)
@@ -212,7 +212,7 @@ class _Writer:
         return next(e for e in self.root.iter("link") if e.get("name") == name)
 
     def _bodies(self, link, parent, start, end):
-        """The bodies on a link's part whose frame is `parent`; the last part has those at the tip."""
+        """Write the bodies on the part of a link whose frame is `parent`; bodies at the tip belong to the last part."""
         for k, body in enumerate(link.bodies):
             last = end >= link.length * (1.0 - 1e-12)
             if start <= body.position < end or (last and body.position >= end):
@@ -241,12 +241,11 @@ class _Writer:
             step = length
 
     def _beam(self, body, link, start, length, more=0.0):
-        """A rigid piece of a link from `start` on, along x [m]; `more` inertia (3, 3) at its origin [kg m^2]."""
+        """Write a rigid piece of a link from `start` on, along x [m]; `more` is added inertia (3, 3) [kg m^2]."""
         mass, first, second, polar = link.moments(start, start + length)
         centre = first / mass
         across = second - mass * centre**2
-        # In the model, sections have an inertia of their own only for twist; without it, use that of the rod that is
-        # drawn.
+        # In the model, sections have a polar inertia only for twist; without it, use that of the rod that is drawn.
         along = polar or 0.5 * mass * self.radius**2
         inertia = np.diag([along, across, across]) + more
         self._inertial(body, mass, inertia, (centre - start, 0.0, 0.0))
@@ -285,7 +284,7 @@ class _Writer:
         ET.SubElement(joint, "origin", xyz=_text(*xyz))
 
     def _limits(self, joint):
-        """Limits of the arm file; a joint without both position limits is continuous, other missing ones are large."""
+        """Write the limits; without both position limits a joint is continuous, and missing other limits are large."""
         limits, element = joint.limits, self.last
         low, high = limits.position
         given = {
@@ -314,7 +313,7 @@ class _Writer:
 
     @staticmethod
     def _visual(body, length, radius, axis, middle, material):
-        """A cylinder about an axis; URDF's own is about z."""
+        """Write a cylinder about an axis; in URDF cylinders are about z."""
         x, y, z = axis
         rpy = (0.0, np.arccos(np.clip(z, -1.0, 1.0)), np.arctan2(y, x))
         visual = ET.SubElement(body, "visual")
@@ -325,7 +324,7 @@ class _Writer:
 
 
 def _about(joint):
-    """Inertia of a hub that is known only about its joint's axis, shape (3, 3) [kg m^2]."""
+    """Inertia of a hub, known only about its joint's axis, shape (3, 3) [kg m^2]."""
     return joint.hub_inertia * np.outer(joint.axis, joint.axis)
 
 

@@ -16,7 +16,7 @@ from .model import damping_matrix, rotation
 
 _KIND = {"y": kernel.Y, "z": kernel.Z, "twist": kernel.TWIST, "reduced": kernel.REDUCED}
 
-#: Fields of the kernels' data that are whole numbers.
+#: Fields of the kernels' data that are integers.
 INTEGERS = (
     *("links", "level", "nodes", "count", "first", "direction", "spring", "housed"),
     *("rooted", "bodies", "host", "body_node", "reduced"),
@@ -37,7 +37,7 @@ def _capacity(value, steps):
 
 
 def roomy(data):
-    """Array sizes that many arms share, so one compilation serves them all; unused room costs no time."""
+    """Array sizes that many arms share, so that they need only one compilation; unused space costs no time."""
     return _sizes(
         _capacity(data.links, (8, 32)),
         _capacity(data.s.shape[1], (16, 60)),
@@ -48,7 +48,7 @@ def roomy(data):
 
 
 def work_space(data, dtype=float, sizes=None):
-    """Work space of the recursions for an arm; of complex numbers or of symbols by `dtype`."""
+    """Work space of the recursions for an arm; `dtype` makes it one of complex numbers or of symbols."""
     sizes = sizes or _sizes(
         data.links, data.s.shape[1], data.nodes, data.body_x.size, len(data.red_tip)
     )
@@ -60,10 +60,8 @@ def work_space(data, dtype=float, sizes=None):
 def packed(values, specs, sizes):
     """A namedtuple of arrays as an array of one record, which compiled code takes by reference.
 
-    Shapes are part of a record's type: with them fixed no array is passed or counted. Arrays are padded with
-    zeros to the sizes given.
-
-    `specs` has the axes of each field, by the names of `sizes`.
+    The shapes are part of the record's type, so compiled code passes no single arrays and counts no references to them.
+    Arrays are padded with zeros to the given `sizes`. `specs` has the axes of each field, by the names of `sizes`.
     """
     fields = {name: np.asarray(value) for name, value in values._asdict().items()}
     shapes = {name: _shape(specs[name], sizes) for name in fields}
@@ -100,7 +98,7 @@ class Load:
     Attributes
     ----------
     averaged : bool
-        Whether it turns about the next joint; then its first moment does not count in the load of a beam.
+        Whether it turns about the next joint; then the load of a beam does not include its first moment.
     """
 
     mass: float
@@ -109,7 +107,7 @@ class Load:
     averaged: bool = False
 
     def moved(self, R, p):
-        """The same body in a frame where this one's origin is p and its axes are R's columns."""
+        """The same body in another frame, in which the old frame has its origin at p and the columns of R as axes."""
         moment = R @ self.moment
         cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
         first = np.outer(moment, p)
@@ -156,7 +154,7 @@ def _straight(link, joint):
 
 
 def outboard(arm):
-    """What hangs on each link's tip when all joints are at zero and all links straight."""
+    """The `Load` on each link's tip, with all joints at zero and all links straight."""
     loads = [_payload(arm)]
     for link, joint in list(zip(arm.links, arm.joints, strict=True))[:0:-1]:
         rotor = Load(0.0, np.zeros(3), joint.rotor_inertia * np.outer(joint.axis, joint.axis))
@@ -175,8 +173,8 @@ def outboard(arm):
 def shapes_of(link, direction, flexibility, load):
     """Mode shapes of a link in a direction, of the kind that the arm file names.
 
-    The load of an inner link is averaged over the turns of the joints beyond: its mass sits at the tip, its
-    inertia about the tip counts, its first moment does not.
+    The load of an inner link is averaged over the angles of the joints beyond it. It has its mass at the tip and its
+    inertia about the tip; its first moment is left out.
 
     `flexibility` is the arm file's for that direction: kind of shape and number of modes.
     """
@@ -243,7 +241,7 @@ def _bending_load(load, direction):
 
 
 def _clamped_mass(link, direction, shapes, load):
-    """Modal mass of a link with its base held and its load at its tip: what modal damping refers to."""
+    """Modal mass of a link with its base held and its load at its tip; modal damping is relative to it."""
     twist = direction == "twist"
     whole = link.polar_inertia_per_length * link.length if twist else link.mass
     out = whole * shapes.gram(weight=_along(link, "polar" if twist else "mass"))
@@ -266,7 +264,8 @@ def _along(link, name):
 
 def node_count(link, modes, level):
     """Number of quadrature nodes in each span of a link between its breaks, for this number of modes in a direction."""
-    # Slopes squared are integrated to some 1e-12, roots of them to 1e-9 up to slopes of 0.6.
+    # Integrals of squared slopes are accurate to about 1e-12; those of roots like sqrt(1 - y'^2) to 1e-9, up to slopes
+    # of 0.6.
     extra = 6 if level == kernel.FORESHORTENING else 12
     widest = np.diff(link.breaks).max()
     return int(np.ceil(3 * modes * min(1.0, 1.5 * widest))) + extra
@@ -279,11 +278,12 @@ class Nodes:
     Attributes
     ----------
     xi, weights : ndarray, shape (G,)
-        Gauss's points and weights in units of the length; points beyond the last span are at 0 and weigh nothing.
+        Gauss points and weights in units of the length; after them the sections of the bodies. These and the unused
+        entries, at 0, have no weight.
     cumulate : ndarray, shape (G, G + 1)
         Weights of the integrals from the base to each node and, last, to the end.
     bodies : list of int
-        The nodes, without weight, at the sections of the link's bodies.
+        Numbers of the nodes at the sections of the link's bodies.
     """
 
     xi: np.ndarray
@@ -371,7 +371,7 @@ def assemble(arm, shapes, loads):
         "body_x": z(B), "body_tip": z((B, K)), "body_slope": z((B, K)), "body_bishop": z((B, K, K)),
         "body_mass": z(B), "body_moment": z((B, 3)), "body_inertia": z((B, 3, 3)),
     }  # fmt: skip
-    # An axis (0, 0, 1) of integers has another type, and would cause another compilation.
+    # An axis (0, 0, 1) of integers would have another type and cause another compilation.
     a = {name: v if name in INTEGERS else np.asarray(v, float) for name, v in a.items()}
     for i, (link, joint) in enumerate(zip(arm.links, arm.joints, strict=True)):
         L = link.length
@@ -428,7 +428,7 @@ def assemble(arm, shapes, loads):
     return data
 
 
-#: Constants of reduced links by the names of their arrays; those of the second order are left out at `first_order`.
+#: Arrays of a reduced link by the names of the kernels' constants; level `first_order` leaves out the second order.
 _REDUCED = {
     "red_C": "translation", "red_l": "rotation", "red_H": "first", "red_G": "second",
     "red_T": "tip_translation", "red_R": "tip_rotation",
@@ -488,7 +488,7 @@ def _fill_bodies(a, i, link, modes, nodes, bodies):
 
 
 def _springs(joints, bending):
-    """Place of each joint's transmission in delta, after the links' modes; -1: it has none."""
+    """Index of each joint's transmission in delta, after the links' modes; -1: the joint has none."""
     has = np.array([j.transmission is not None for j in joints])
     return np.where(has, bending + np.cumsum(has) - 1, -1).astype(np.int64)
 
@@ -505,7 +505,7 @@ def _spring_constants(t):
 
 
 def _fill_mode(a, i, j, link, shape, number, direction, points):
-    """The constants of one mode that concern no other."""
+    """The constants of one mode that involve no other mode."""
     L, rho = link.length, link.mass_per_length
     a["direction"][i, j] = _KIND[direction]
     if direction == "twist":

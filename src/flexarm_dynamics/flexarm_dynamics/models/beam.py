@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Mode shapes of a uniform Euler-Bernoulli beam clamped at its base.
 
-Every shape here has the form (Siciliano & Book 1986, (A1), written so that nothing cancels)
+Every shape here has the form (Siciliano & Book 1986, (A1), rewritten to avoid cancellation)
 
 .. math::
     \phi(\xi) = a\cos\beta\xi + b\sin\beta\xi + c\,e^{-\beta\xi} + d\,e^{-\beta(1-\xi)},
     \qquad a = -(c + d e^{-\beta}), \quad b = c - d e^{-\beta},
 
-with :math:`\xi = \eta/L`; `a` and `b` are what :math:`\phi(0) = \phi'(0) = 0` leaves. The textbook's
+with :math:`\xi = \eta/L`; `a` and `b` follow from :math:`\phi(0) = \phi'(0) = 0`. The textbook's
 :math:`\cosh - \sinh` loses all digits near :math:`\beta = 36`; here every term is at most of order one,
-so the tenth mode is as good as the first. Shapes are scaled to :math:`\int_0^1 \phi^2 d\xi = 1` and signed so
+so the tenth mode is as accurate as the first. Shapes are scaled to :math:`\int_0^1 \phi^2 d\xi = 1` and signed so
 that :math:`\phi''(0) > 0`: the tip of the first mode moves to the positive side.
 
 Derivatives are with respect to :math:`\xi`; divide by `L` once for a slope, twice for a curvature.
@@ -23,10 +23,10 @@ from scipy.optimize import brentq
 
 from ..errors import ModelError
 
-#: Modal integrals are computed to this, relative to the largest entry (Gauss-Legendre, tested).
+#: Error of the modal integrals, relative to the largest entry (Gauss-Legendre, tested).
 INTEGRAL_TOLERANCE = 1e-12
 
-#: Heaviest tip load, relative to the beam's mass and inertia: up to this the lowest wave number is accurate.
+#: Heaviest tip load for which the lowest wave number is accurate, in units of the beam's m and m L^2.
 MAX_LOAD = 1e10
 
 
@@ -82,7 +82,7 @@ class ModeShapes:
         edge = np.exp(-beta)
         a, b = -(c + d * edge), c - d * edge
         cos, sin = np.cos(beta * x), np.sin(beta * x)
-        # d/dxi turns (cos, sin) into beta * (-sin, cos): four derivatives make the circle.
+        # d/dxi turns (cos, sin) into beta * (-sin, cos); after four derivatives the functions repeat.
         wave = (a * cos + b * sin, -a * sin + b * cos, -a * cos - b * sin, a * sin - b * cos)[
             derivative % 4
         ]
@@ -103,12 +103,12 @@ class ModeShapes:
         return 0.5 * (gram + gram.T)
 
     def _quadrature(self):
-        # 32 nodes and six per unit of the highest wave number resolve products of two shapes.
+        # For products of two shapes, 32 nodes and six more per unit of the highest wave number are enough.
         return _gauss_legendre(32 + int(6 * np.max(self.beta)))
 
 
 def _shapes(beta, c, d):
-    """Scale to unit norm and sign by the curvature at the clamp."""
+    """Shapes of unit norm, with positive curvature at the clamp."""
     raw = ModeShapes(np.asarray(beta, float), np.asarray(c, float), np.asarray(d, float))
     norm = np.sqrt(np.diag(raw.gram()))
     sign = np.where(raw(0.0, 2) < 0.0, -1.0, 1.0)
@@ -118,8 +118,8 @@ def _shapes(beta, c, d):
 def free_end_shapes(beta):
     r"""Shapes (A1) with the free end's :math:`\phi''(1) = 0` for given wave numbers.
 
-    This is (A1) with the sign of :math:`\nu_i` corrected (published: :math:`\nu_i > 0`, which is no free end).
-    The shear :math:`\phi'''(1)` vanishes too only at the clamped-free wave numbers.
+    This is (A1) with the sign of :math:`\nu_i` corrected (the published :math:`\nu_i > 0` does not give a free end).
+    The shear :math:`\phi'''(1)` is zero, too, only for the clamped-free wave numbers.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def clamped_free(modes):
     """
 
     def scaled(b):
-        # Divided by cosh: no overflow, roots near odd multiples of pi/2.
+        # The equation divided by cosh: it does not overflow, and its roots are near odd multiples of pi/2.
         return np.cos(b) + 2.0 * np.exp(-b) / (1.0 + np.exp(-2.0 * b))
 
     brackets = [(i * np.pi, (i + 1.0) * np.pi) for i in range(modes)]
@@ -163,8 +163,8 @@ def clamped_free(modes):
 def from_frequencies(frequencies, length, mass_per_length, stiffness):
     r"""Shapes (A1) with :math:`\beta_i^4 = \rho A (2\pi f_i)^2 L^4 / EI` from measured frequencies.
 
-    They satisfy the clamp and :math:`\phi''(1) = 0`, are not orthogonal, and differ from the exact loaded
-    modes; this is what the paper does.
+    They satisfy the conditions at the clamp and :math:`\phi''(1) = 0`. They are not orthogonal, and differ from the
+    exact loaded modes. The paper does it this way.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
     Returns
     -------
     ModeShapes
-        Orthogonal in the mass of beam and load together; scaled to :math:`\int\phi^2 = 1`.
+        Orthogonal with respect to the mass of beam and load together; scaled to :math:`\int\phi^2 = 1`.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def loaded(modes, length, mass_per_length, tip_mass=0.0, tip_inertia=0.0, tip_of
         return m[0, ..., 0] * m[1, ..., 1] - m[0, ..., 1] * m[1, ..., 0]
 
     roots = []
-    # Heavy loads bring two roots near zero, at least a factor of 1.9 apart.
+    # With heavy loads two roots are near zero, at least a factor of 1.9 apart.
     step = np.pi / 64.0
     grid = np.append(
         np.geomspace(1e-3, step, 16, endpoint=False), np.arange(step, (modes + 1.5) * np.pi, step)
@@ -353,7 +353,7 @@ def twist(modes, length, polar_inertia_per_length, tip_inertia=0.0):
     def tip_condition(b):
         return np.cos(b) - ratio * b * np.sin(b)
 
-    # Slightly beyond pi/2: with a free tip the root is there, and its cosine rounds to either side of zero.
+    # Brackets end slightly beyond pi/2: with a free tip the root is there, and the rounded cosine may have either sign.
     brackets = [(i * np.pi, (i + 0.5) * np.pi + 1e-9) for i in range(modes)]
     roots = [brentq(tip_condition, lo, hi, xtol=1e-15, rtol=8.9e-16) for lo, hi in brackets]
     return TwistShapes(np.array(roots))

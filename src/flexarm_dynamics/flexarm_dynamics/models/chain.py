@@ -3,18 +3,18 @@ r"""The general model: arms with any number of rigid or flexible links, evaluate
 
 A link is a beam along its frame's x axis, uniform or with sections that change along it. It bends (Euler-Bernoulli, no
 rotary inertia of the sections in bending) and twists (with the sections' polar inertia) in the assumed modes of the arm
-file: :math:`y(x,t)=\sum_i\phi_i(x/L)\delta_i(t)`. A link can also be given by reduced matrices, with modes of their own
-(`arm.reduced`). The mass matrix depends on the deflections; nothing of the Lagrangian is left out at the arm's `level`:
+file: :math:`y(x,t)=\sum_i\phi_i(x/L)\delta_i(t)`. A link can also be given by reduced matrices, which have modes of
+their own (`arm.reduced`). The mass matrix depends on the deflections. At the arm's `level` no term of the Lagrangian is
+left out:
 
-- first order: displacements are linear in delta, the tip turns by its slopes (y' about z, -z' about y, twist);
+- first order: displacements are linear in delta, and the tip turns by its slopes (y' about z, -z' about y, twist);
 - `foreshortening`: the axis keeps its length to second order, so that a spinning link is stiffer;
 - `finite_slope`: the axis keeps its length exactly, its curvature is y''/sqrt(1 - y'^2), the tip turns by
   arcsin y'.
 
-The hub's inertia turns with its link; a rotor behind a gear of ratio N spins at ``a . w_carrier + N qd``; the
-motor's mass sits at the joint and hangs on the previous link, as does its housing. The paper's control model
-(assumptions a) and b): no deflections in the mass matrix, no products of deflections) is what `Chain.terms`
-gives without deflections.
+The hub's inertia turns with its link. A rotor behind a gear of ratio N spins at ``a . w_carrier + N qd``. The motor's
+mass is at the joint and moves with the previous link, as does its housing. Without deflections, `Chain.terms` gives the
+paper's control model (assumptions a) and b): no deflections in the mass matrix, no products of deflections).
 """
 
 from functools import cached_property
@@ -51,12 +51,12 @@ from .assembly import (
 )
 from .model import ArmModel, Stepper, Terms, about_axis, explicit_stepper, rotation
 
-#: In this order: each module comes after those whose functions it calls.
+#: Kernel modules, each after those whose functions it calls.
 _MODULES = (
     chain_data, vectors, sections, bodies, placing, transmissions, recursions, chain, implicit_steps, integrators,
 )  # fmt: skip
 CHAIN_SOURCES = tuple(load.source(module) for module in _MODULES)
-#: For arms without transmissions, without housings, and without friction beyond Coulomb's.
+#: Sources for arms without transmissions, without housings, and without friction beyond Coulomb's.
 PLAIN_SOURCES = (
     CHAIN_SOURCES[0].replace("JOINT_PARTS = True", "JOINT_PARTS = False"),
     *CHAIN_SOURCES[1:],
@@ -76,7 +76,7 @@ class Chain(ArmModel):
     ----------
     arm : Arm
     compiled : bool
-        False: evaluate the kernels as plain Python, for debugging; some hundred times slower.
+        False: evaluate the kernels as plain Python, for debugging; about a hundred times slower.
     shapes : mapping, optional
         (link, direction) to `beam.ModeShapes`; if not given, the shapes follow from this arm's own loads.
     """
@@ -112,7 +112,7 @@ class Chain(ArmModel):
 
     @cached_property
     def complex_kernel(self):
-        """The kernels for complex numbers: a module of its own, so that both can be compiled at once."""
+        """The kernels for complex numbers: a separate module, so that both can be compiled at the same time."""
         return load.joined("chain_complex", self._sources, self._compiled)
 
     @cached_property
@@ -140,7 +140,7 @@ class Chain(ArmModel):
         return self._new_work(complex)
 
     def _check_inertia(self):
-        """Refuse an arm that has a motion without moving mass, for example a roll joint on a line of mass."""
+        """Refuse an arm that can move without moving mass: for example a link without polar inertia about its axis."""
         n = self.n_joints
         for q in (np.zeros(n), 0.7 + np.arange(n)):
             M = self.mass_matrix(q)
@@ -201,7 +201,7 @@ class Chain(ArmModel):
 
     @cached_property
     def _transmissions(self):
-        """(place in delta, constants) of each transmission."""
+        """(index in delta, constants) of each transmission."""
         d = self.data
         return [(d.spring[i], d.transmission[i]) for i in np.flatnonzero(d.spring >= 0)]
 
@@ -225,7 +225,7 @@ class Chain(ArmModel):
     def linearisation(self, q, qd, delta=None, delta_d=None):
         r"""Derivatives of `forces` by delta and by its rates, to machine precision (complex step).
 
-        Without deflections, play is taken as closed: transmissions have their stiffness and damping in contact.
+        Without deflections, all play is closed: transmissions have their stiffness and damping in contact.
 
         Returns
         -------
@@ -302,7 +302,7 @@ class Chain(ArmModel):
 
     @cached_property
     def _tape(self):
-        """Recorded terms of the straight arm, which control laws need at every sample; None if not recorded."""
+        """Recorded terms of the straight arm, for control laws that need them at every sample; None if not recorded."""
         if not self._compiled or self.data.level != chain_data.FIRST_ORDER:
             return None
         return self._recorded(straight_arm.Terms)
@@ -312,7 +312,7 @@ class Chain(ArmModel):
 
     @cached_property
     def _slow_tape(self):
-        """Recorded torque of the slow subsystem; None if no terms are recorded, or if other terms are added to them."""
+        """Recorded torque of the slow subsystem; None if no terms are recorded, or if `_straight_arm` adds to them."""
         if self._tape is None or self._transmissions or self._slips:
             return None
         return self._recorded(straight_arm.SlowTorque)
@@ -377,7 +377,7 @@ class Chain(ArmModel):
         return type(self)(self.arm.without_play, self._compiled, self._shapes)
 
     def transmission_rates(self):
-        """As `ArmModel.transmission_rates`: rates of spring or damper with the rest of a straight arm free."""
+        """As `ArmModel.transmission_rates`: rates of spring or damper in a straight arm that is otherwise free."""
         if not self._transmissions:
             return 0.0, 0.0
         H = np.linalg.inv(self.mass_matrix(np.zeros(self.n_joints)))
@@ -391,7 +391,7 @@ class Chain(ArmModel):
     def static_deflection(self, q):
         """As `ArmModel.static_deflection`; with play, each link rests on the flank to which its load presses it.
 
-        A link without load rests in the middle of its play. A link that hangs within its play rests where it hangs.
+        A link without load rests in the middle of its play. A link that neither flank holds hangs within its play.
         """
         sharp = self._on_flanks(q)
         rounded = [(j, c) for j, c in self._transmissions if c[4] > 0.0]
@@ -403,7 +403,7 @@ class Chain(ArmModel):
         return self._rest(q, soften, sharp) if rounded else sharp
 
     def _on_flanks(self, q):
-        """`static_deflection` with the play's corners sharp."""
+        """`static_deflection` with sharp corners of the play."""
         play = [(j, c) for j, c in self._transmissions if c[2] > 0.0]
         if not play or not any(self.arm.gravity):
             return super().static_deflection(q)
@@ -427,7 +427,7 @@ class Chain(ArmModel):
             ]
             if not pulled:
                 return delta
-            for j in pulled:  # a flank can't pull: try the other one, then none
+            for j in pulled:  # a flank can't pull: try the other one, then neither
                 (hangs if j in turned else turned).add(j)
                 side[j] = -side[j]
 
@@ -448,7 +448,7 @@ class Chain(ArmModel):
         Returns
         -------
         linear, angular : ndarray, shape (3,)
-            [kg m/s], [kg m^2/s]; rotors count with their spin about their joint's axis.
+            [kg m/s], [kg m^2/s]; they include the spin of the rotors about their joints' axes.
         """
         out = np.zeros((2, 3))
         self.kernel.momentum(
@@ -460,7 +460,7 @@ class Chain(ArmModel):
     # Kinematics --------------------------------------------------------------------------------
 
     def frames(self, q, delta=None):
-        """Orientation and origin of each link's base frame and, last, of the tip frame, in the base frame.
+        """Orientation and origin of each joint's frame, turned with its link, and last of the tip, in the base frame.
 
         Returns
         -------
@@ -515,7 +515,7 @@ class Chain(ArmModel):
         return place, jacobian
 
     def _cut(self, index, position):
-        """The data with link `index` ending at `position`, for the kinematics of that section."""
+        """The data of an arm whose link `index` ends at `position`: its tip has the kinematics of that section."""
         link = self.arm.links[index]
         if not 0.0 <= position <= link.length * (1.0 + 1e-12):
             field, limit = f"position on {link.name}", f"0 to {link.length} m"
@@ -547,7 +547,7 @@ class Chain(ArmModel):
         T[r, m], R[r, m] = translation, rotation
         if (
             part < 1.0
-        ):  # the archive has the second order only at the tip: in proportion, for pictures
+        ):  # the archive has the second order only at the tip: scale it in proportion, for pictures
             T2[r], R2[r] = part * T2[r], part * R2[r]
         return d._replace(links=index + 1, red_tip=place, red_T=T, red_R=R, red_T2=T2, red_R2=R2)
 
@@ -600,7 +600,8 @@ class Chain(ArmModel):
         R, p = self.frames(q, delta)
         ends = p[1:].copy()
         for i in range(self.n_joints - 1):
-            # The next joint is away from the tip by its origin, in the tip's frame: undo that joint's turn.
+            # The frame after the tip is the next joint's. Its offset from the tip, origin_xyz, is in the tip's frame,
+            # which is this frame with the joint's rotation undone.
             joint = self.arm.joints[i + 1]
             place = self.data.spring[i + 1]
             angle = q[i + 1] + (delta[place] if delta is not None and place >= 0 else 0.0)
@@ -610,7 +611,7 @@ class Chain(ArmModel):
 
     @cached_property
     def planar_axis(self):
-        """Common axis, in the base frame, of an arm whose joints all turn about parallel axes; None for other arms."""
+        """Axis, in the base frame, to which all joint axes are parallel; None if there is no such axis."""
         R, _ = self.frames(np.zeros(self.n_joints))
         axes = np.einsum("ijk,ik->ij", R[:-1], self.data.axis)
         return axes[0] if np.allclose(np.cross(axes, axes[0]), 0.0, atol=1e-9) else None
@@ -618,8 +619,8 @@ class Chain(ArmModel):
     def base_angles(self, q, delta=None):
         """Absolute rotation of each link's base about its joint's axis, for a planar arm, shape (n,) [rad].
 
-        It is measured from the base frame's orientation, without the fixed turns of the joints' origins, and counted
-        beyond a full turn. For a straight planar arm it is the sum of the joint angles.
+        It is measured from the base frame's orientation, without the fixed rotations of the joints' origins. It may
+        exceed a full turn. For a straight planar arm it is the sum of the joint angles.
         """
         q = self._joint(q, "q")
         R, _ = self.frames(q, delta)
@@ -640,12 +641,12 @@ class Chain(ArmModel):
 
     @cached_property
     def straight_line(self):
-        """Generated right-hand side of this arm's structure: (module, constants); None if it is too long."""
+        """Generated right-hand side of this arm's structure: (module, constants); None if too long or not compiled."""
         return self._generated and self._generated[:2]
 
     @cached_property
     def _generated(self):
-        """As `straight_line`, and also the way in which sums get into the code."""
+        """As `straight_line`, and third the way in which the code gets its sums, one of `generated.ways`."""
         if not self._compiled:
             return None
         for way in generated.ways(self.data):
@@ -658,7 +659,7 @@ class Chain(ArmModel):
         return None
 
     def stepper(self, method, straight_line=True):
-        """As `ArmModel.stepper`; ``straight_line=False`` asks for the recursion in loops."""
+        """As `ArmModel.stepper`; ``straight_line=False`` takes the recursion in loops instead of generated code."""
         if method is not None and straight_line and self._generated is not None:
             module, data, way = self._generated
             if way == generated.AT_NODES:
@@ -677,7 +678,7 @@ class Chain(ArmModel):
         stages = np.zeros((4, size))  # of the implicit method
 
         def lock(mask):
-            driven[:] = mask  # with the acceleration zero
+            driven[:] = mask  # at zero acceleration
             stages[:, size // 2 : size // 2 + n] = 0.0
 
         lock = lock if lockable else None

@@ -4,7 +4,7 @@ r"""Fixed-step methods for an arm's compiled integrators, and how short their st
 Dormand and Prince's explicit Runge-Kutta method of order eight (scipy's tableau): with omega h = 1 it loses 3e-7 of a
 mode's energy per period, and 6e-10 for a mode of half that frequency. RK4 loses 9e-7 with omega h = 0.1. With omega h =
 2, Dormand and Prince's method loses 2e-4, while a structural damping of 0.01 takes 0.12 of the mode's energy: such a
-mode need not be resolved as if it rang for ever.
+mode needs less resolution than an undamped one.
 """
 
 import numpy as np
@@ -59,7 +59,7 @@ def substeps(model, period, method="dop853", undamped=False):
     method : str
         One of `METHODS`.
     undamped : bool
-        Count damped modes as if they were not damped.
+        True: treat damped modes as undamped.
 
     Returns
     -------
@@ -68,7 +68,7 @@ def substeps(model, period, method="dop853", undamped=False):
     Raises
     ------
     ModelError
-        When the highest mode would need more than `MAX_SUBSTEPS`.
+        If the highest mode needs more than `MAX_SUBSTEPS`.
     """
     fastest, with_play = model.transmission_rates()
     count = max(1, int(np.ceil(with_play * period / PLAY_PHASE_PER_STEP)))
@@ -90,9 +90,18 @@ def substeps(model, period, method="dop853", undamped=False):
 
 
 def lost(method, phase):
-    r"""Fraction of a mode's energy that an explicit method takes per period, by the mode's phase per step, (k,).
+    r"""Fraction of a mode's energy that an explicit method takes per period.
 
-    :math:`1 - |R(i\phi)|^{4\pi/\phi}`, with the method's :math:`R(z) = 1 + z\,b^T(I - zA)^{-1}\mathbf{1}`.
+    Parameters
+    ----------
+    method : str
+    phase : ndarray, shape (k,)
+        :math:`\phi`, by which modes turn in a step [rad].
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        :math:`1 - |R(i\phi)|^{4\pi/\phi}`, with the method's :math:`R(z) = 1 + z\,b^T(I - zA)^{-1}\mathbf{1}` [-].
     """
     tableau, ones = METHODS[method], np.ones(len(METHODS[method].weights))
     z = 1j * np.asarray(phase, float)[..., None, None]
@@ -102,7 +111,7 @@ def lost(method, phase):
 
 
 def _damped_substeps(model, period, method, count):
-    """The fewest substeps, at most `count`, with which the method's loss is small beside each mode's own damping."""
+    """The fewest substeps, at most `count`, with which the method's loss is small compared with each mode's damping."""
     n = model.n_joints
     omega, shapes = model.normal_modes()
     C = model.terms(np.zeros(n), np.zeros(n)).C2

@@ -3,14 +3,14 @@ r"""Inverse kinematics: finds joint angles that put the tip of the straight or o
 
 The tip of an arm at rest is :math:`p(q, \delta_s(q))`, with :math:`\delta_s` the deflections under gravity
 (`ArmModel.static_deflection`), so the sag of the links is taken into account. Newton's method takes the smallest step
-that reaches the point, damped after Levenberg and Marquardt,
+that reaches the point, with the damping of Levenberg and Marquardt,
 
 .. math:: \Delta q = J^T (J J^T + \lambda I)^{-1} (p_{wanted} - p), \qquad
     J = \frac{\partial p}{\partial q} - \frac{\partial p}{\partial\delta}
     \left(\frac{\partial F_2}{\partial\delta}\right)^{-1} \frac{\partial F_2}{\partial q},
 
-:math:`F_2` the forces on the modes at rest. The smallest step keeps a redundant arm near where it starts. A joint that
-would leave its limits is held at the limit.
+where :math:`F_2` are the forces on the modes at rest. The smallest step keeps a redundant arm near its start. A joint
+that would leave its limits is held at the limit.
 """
 
 from dataclasses import dataclass
@@ -21,26 +21,26 @@ from ..errors import ModelError, check_shape
 from ..linear import jacobian
 from .chain import Chain
 
-#: A tip nearer than this has arrived [m].
+#: The target is reached if the tip is no farther from it than this [m].
 TOLERANCE = 1e-10
 #: No joint turns farther in one step of the search [rad].
 MAX_STEP = 0.5
 _STEPS = 100
-#: Distances from the start at which further searches begin [rad], to leave singular configurations and get around
-#: limits.
+#: Further searches begin up to these distances from the start [rad], to leave singular configurations and to get
+#: around limits.
 _SPREADS = (0.05, 0.3, 1.0, 2.0, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a search ended.
+    """Result of a search.
 
     Attributes
     ----------
     q : (n,) array
         Joint angles [rad].
     tip : (3,) array
-        The tip there [m].
+        Position of the tip [m].
     distance : float
         Distance from the wanted point [m].
     """
@@ -57,7 +57,7 @@ class TipKinematics:
     ----------
     model : ArmModel
     bent : bool
-        Under its own weight, or straight as if it were rigid.
+        True: the arm bends under its own weight. False: it stays straight, as if it were rigid.
     """
 
     def __init__(self, model, bent=True):
@@ -74,7 +74,7 @@ class TipKinematics:
         return self.model.tip_position(q, self.deflection(q) if delta is None else delta)
 
     def jacobian(self, q, delta=None):
-        """Derivative of `tip` by the joints, (3, n) [m/rad]; good to some nine digits."""
+        """Derivative of `tip` by the joints, (3, n) [m/rad]; accurate to about nine digits."""
         delta = self.deflection(q) if delta is None else delta
         J = jacobian(lambda x: self.model.tip_position(x, delta), q)
         if not self.bent:
@@ -86,15 +86,15 @@ class TipKinematics:
         return J - jacobian(lambda x: self.model.tip_position(q, x), delta) @ give
 
     def _modal_forces(self, q, delta):
-        """Forces on the modes at rest, (m,): zero at the deflections of `deflection`."""
+        """Forces on the modes at rest, (m,); they are zero for the result of `deflection`."""
         n, rest = self.model.n_joints, np.zeros(self.model.n_joints)
-        if isinstance(self.model, Chain):  # without computing the derivatives in its terms
+        if isinstance(self.model, Chain):  # not from its terms: these compute derivatives, too
             return self.model.forces(q, rest, delta)[n:]
         terms = self.model.terms(q, rest, delta, np.zeros(self.model.n_modes))
         return terms.f2 + terms.K2 @ delta
 
     def search(self, target, start) -> Solution:
-        """Go from `start` towards the target until that brings the tip no nearer; see `solve`."""
+        """Go from `start` towards the target, until the tip is there or gets no closer; see `solve`."""
         q, damping = np.clip(start, self.low, self.high), 1e-3
         tip = self.tip(q)
         error = target - tip
@@ -116,7 +116,7 @@ class TipKinematics:
                 gain = np.linalg.norm(error) - np.linalg.norm(target - new)
                 q, tip, error, damping = there, new, target - new, max(0.03 * damping, 1e-13)
                 if np.linalg.norm(error) > TOLERANCE and gain < 1e-8 * np.linalg.norm(error):
-                    break  # as near as it gets
+                    break  # it gets no closer
             elif damping > 1e6:
                 break
             else:
@@ -136,7 +136,7 @@ def solve(model, target, start=None, bent=True) -> Solution:
     start : (n,) array_like, optional
         Where the search begins; solutions near it are found first. Zero if not given [rad].
     bent : bool
-        The arm bent by its weight, or straight.
+        True: the arm bends under its own weight. False: it is straight.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def solve(model, target, start=None, bent=True) -> Solution:
     ShapeError
         If `target` or `start` has another shape.
     ModelError
-        If the point is not finite or no configuration was found that reaches it; names the distance.
+        If the point is not finite, or if no configuration was found that reaches it; the message has the distance.
     """
     target, start = checked(model, target, start)
     kinematics = TipKinematics(model, bent)
@@ -177,7 +177,7 @@ def checked(model, target, start):
 
 
 def nearest(solution):
-    """Say how near a search came."""
+    """In words, the closest tip position that a search found."""
     return (
         f"the nearest found is {show(solution.tip)} m, {solution.distance:.6g} m away, at q ="
         f" {show(solution.q)} rad"

@@ -2,19 +2,20 @@
 r"""Chooses the level of the bending kinematics at which an arm is simulated, and estimates what each level leaves out.
 
 `first_order`: displacements are linear in the deflections. `stiffening`: links keep their length to second order, so a
-spinning link is stiffer. `finite_slope`: they keep it exactly, and their curvature and their tips' angles hold for
-large slopes. See docs/dynamics.md.
+spinning link is stiffer. `finite_slope`: links keep their length exactly, and their curvature and their tips' angles
+are correct for large slopes. See docs/dynamics.md.
 
 For a link with slopes :math:`s^2 = y'^2 + z'^2`, deflection d of its tip and a length l of the arm beyond it, the first
-term that is left out moves the arm's tip by about
+term that a level leaves out would move the arm's tip by about
 
 .. math::
     e_1 = \tfrac12\int_0^L s^2 dx + |\phi(L)^T K^{-1} K_g\,\delta|, \qquad
     e_2 = \tfrac12 s^2 d + \tfrac16 s^3 l, \qquad e_3 = \tfrac18 s^4 d
 
 at the three levels. The first is the foreshortening, and the bending that the geometric stiffness :math:`K_g` of the
-axial forces would prevent or add. The second comes from the curvature's factor :math:`(1-s^2)^{-1/2}` and from the
-angle's :math:`\arcsin s - s`. The third is the next term of both, which shapes of small deflections can't follow.
+axial forces would prevent or add. The second comes from the factor :math:`(1-s^2)^{-1/2}` of the curvature and from the
+error :math:`\arcsin s - s` of the angle. The third is the next term of both; the mode shapes of small deflections
+can't represent it.
 """
 
 from dataclasses import dataclass, replace
@@ -27,18 +28,18 @@ from .chain import Chain
 
 FIRST_ORDER, STIFFENING, FINITE_SLOPE = "first_order", "stiffening", "finite_slope"
 AUTO = "auto"
-#: What can be asked for.
+#: Levels that can be requested.
 LEVELS = (AUTO, FIRST_ORDER, STIFFENING, FINITE_SLOPE)
 
-#: `auto` takes the lowest level that leaves out less than this at the tip under the largest known loads [m].
+#: `auto` takes the lowest level that leaves out no more than this at the tip under the largest known loads [m].
 NEGLIGIBLE = 1e-6
 #: Deflections under suddenly applied loads, relative to those at rest [-].
 OVERSHOOT = 2.0
-#: A level is beyond its range if it leaves out more than this fraction of the arm's length [-].
+#: `first_order` and `stiffening` are beyond their range if they leave out more than this, over the arm's length [-].
 TOLERANCE = 1e-4
-#: Largest slope at which `finite_slope` was compared with independent codes [-].
+#: Largest slope at which `finite_slope` was compared with independent codes; the end of its range [-].
 MAX_SLOPE = 0.5
-#: Stations along a link where its slopes are evaluated: Gauss points, and the tip.
+#: Number of Gauss points along a link where its slopes are evaluated; they are also evaluated at its tip.
 _STATIONS = 8
 
 
@@ -65,7 +66,7 @@ def at_level(arm, level):
     Raises
     ------
     ModelError
-        For an unknown level, and for one above `first_order` of a model other than `chain`: the closed forms have
+        For an unknown level, and for a level above `first_order` if the model is not `chain`: the closed forms have
         their own kinematics.
     """
     if level not in LEVELS[1:]:
@@ -100,11 +101,11 @@ def simulated(arm, level=AUTO, drive=None, negligible=NEGLIGIBLE):
     ----------
     arm : Arm
     level : str
-        One of `LEVELS`. `auto` takes the lowest level that leaves out less than `negligible` under the largest known
+        One of `LEVELS`. `auto` takes the lowest level that leaves out no more than `negligible` under the largest known
         loads, but none below the flags of the arm file. These loads are gravity, with the joints straight or one of
         them at right angles, and the torques of the `drive`, or of the joints' limits, suddenly applied. Without limits
-        the loads are unknown, and the level is `finite_slope`. Models other than `chain` have their own kinematics, and
-        stay as they are.
+        the loads are unknown, and the level is `finite_slope`. Models other than `chain` have their own kinematics, so
+        their arms stay as they are.
     drive : Drive, optional
     negligible : float
         At the tip [m].
@@ -112,7 +113,7 @@ def simulated(arm, level=AUTO, drive=None, negligible=NEGLIGIBLE):
     Returns
     -------
     Arm
-        Its flags `foreshortening` and `finite_slope` state the level taken.
+        With the chosen level in its flags `foreshortening` and `finite_slope`.
     """
     if level != AUTO:
         return at_level(arm, level)
@@ -138,7 +139,7 @@ def neglected(arm, drive=None):
     Returns
     -------
     first_order, stiffening : float
-        Infinite where loads are unknown.
+        Infinite if the loads are unknown.
     """
     drive = drive or Drive()
     chain = Chain(at_level(arm, FIRST_ORDER))
@@ -149,7 +150,7 @@ def neglected(arm, drive=None):
     if not np.isfinite(known).all():
         return np.inf, np.inf
     K, rest = chain.stiffness_matrix(), np.zeros(n)
-    # Without the joints' speeds, axial forces are unknown: all of the bending may be theirs.
+    # Axial forces may prevent or add this fraction of the bending: all of it with gravity or at unknown speeds.
     speed = arm.velocity_limits if drive.velocity is None else np.asarray(drive.velocity, float)
     ratio = 1.0
     if np.isfinite(speed).all() and not any(arm.gravity):
@@ -212,7 +213,7 @@ class Slopes:
         self._lever = np.array([self._lever[name] for name in self.names])
 
     def of(self, delta, added=False):
-        """Slope of each link at the stations, (links, stations) [-]; `added`: with the sizes of all modes added up."""
+        """Slope of each link at the stations, (links, stations) [-]; `added`: the sum of all modes' magnitudes."""
         rows = np.abs(self._slope) if added else self._slope
         return np.hypot(*(rows @ delta))
 
@@ -241,14 +242,14 @@ class Range:
     Parameters
     ----------
     model : ArmModel
-        Of the simulated arm.
+        Model of the simulated arm.
 
     Attributes
     ----------
     error : float
         The largest estimate so far of what the level leaves out at the tip [m].
     warning : str
-        Why the level is beyond its range, from the first time that it is; empty until then.
+        Why the level is beyond its range, set the first time that it is; empty until then.
     """
 
     def __init__(self, model):
@@ -258,7 +259,7 @@ class Range:
         self.reset()
 
     def reset(self):
-        """Begin anew."""
+        """Forget all earlier states."""
         self.error, self.warning = 0.0, ""
 
     @cached_property

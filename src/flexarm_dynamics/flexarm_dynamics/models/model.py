@@ -33,9 +33,9 @@ class Terms(NamedTuple):
     f1, f2 : ndarray, shape (n,), (m,)
         Coriolis, centrifugal, gravitational and friction terms.
     C1, C2 : ndarray, shape (n, m), (m, m)
-        What multiplies the deflection rates; structural damping is in C2.
+        Factors of the deflection rates; structural damping is in C2.
     K1, K2 : ndarray, shape (n, m), (m, m)
-        What multiplies the deflections; K2 holds the elastic and the centrifugal stiffness.
+        Factors of the deflections; K2 contains the elastic and the centrifugal stiffness.
     """
 
     M: np.ndarray
@@ -71,9 +71,9 @@ class ArmModel(ABC):
 
     def __init__(self, arm):
         self.arm = arm
-        #: The arm for which the mode shapes are made, and the factor of its payload: see `with_payload`.
+        #: The arm whose loads the mode shapes follow from, and the factor of its payload: see `with_payload`.
         self.origin = arm, 1.0
-        #: Models that `fuller` has made, by its arguments.
+        #: Models that `fuller` has made, with its arguments as keys.
         self._fuller = {}
         self.joint_names = arm.joint_names
         self.mode_names = arm.mode_names
@@ -95,8 +95,8 @@ class ArmModel(ABC):
     def terms(self, q, qd, delta=None, delta_d=None):
         """Terms of (2).
 
-        Without deflections, they are the paper's control model: a) H does not depend on the deflections, b) no products
-        of deflections, so that C1 and K1 depend on the joints alone.
+        Without deflections, they are the paper's control model: a) H does not depend on the deflections, b) there are
+        no products of deflections, so C1 and K1 depend only on the joints.
 
         Returns
         -------
@@ -104,7 +104,7 @@ class ArmModel(ABC):
         """
 
     def terms_along(self, motions):
-        """`Terms` at several states of the straight arm, each array with a leading axis of k.
+        """`Terms` at k states of the straight arm; each array has a leading axis of length k.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class ArmModel(ABC):
         return Terms(*map(np.array, zip(*each, strict=True)))
 
     def mass_matrix(self, q, delta=None):
-        """M of (2), shape (n + m, n + m); without deflections, of the straight arm."""
+        """M of (2), shape (n + m, n + m); that of the straight arm if no deflections are given."""
         none = np.zeros(self.n_joints), None if delta is None else np.zeros(self.n_modes)
         return self.terms(q, none[0], delta, none[1]).M
 
@@ -133,8 +133,8 @@ class ArmModel(ABC):
     def slow_torque(self, q, qd, acceleration):
         """Torque (n,) that gives the slow subsystem (10) an acceleration at q, qd, (n,) each [N m].
 
-        As `singular_perturbation.slow_torque` with the `terms` at this state, without computing those that it does not
-        need.
+        As `singular_perturbation.slow_torque` with the `terms` at this state. Models may skip terms that are not
+        needed.
         """
         return slow_torque(self.terms(q, qd), acceleration)
 
@@ -163,9 +163,9 @@ class ArmModel(ABC):
         """`beam.ModeShapes` of a link in a direction."""
 
     def friction_table(self):
-        """Friction of the joints as the integrators take it: viscous, Coulomb, smoothing speed; shape (n, 3).
+        """Friction of the joints, as an argument of the integrators: viscous, Coulomb, smoothing speed; shape (n, 3).
 
-        The Stribeck part, and the part from the transmitted torque, are in the equations of motion.
+        The equations of motion contain the Stribeck part, and the part that grows with the transmitted torque.
         """
         return self._friction.copy()
 
@@ -189,18 +189,18 @@ class ArmModel(ABC):
         """
 
     def driven_stepper(self, method):
-        """As `stepper`, with joint accelerations in place of torque; None: the model has none."""
+        """As `stepper`, with joint accelerations in place of torque; None if the model has no such integrator."""
         return None
 
     def lockable_stepper(self, method):
-        """As `stepper`, with `Stepper.lock`: for brakes.
+        """As `stepper`, with `Stepper.lock`, for brakes.
 
         `method` is that of `stepper`.
 
         Raises
         ------
         ModelError
-            Where the model has none.
+            If the model can't lock joints.
         """
         raise ModelError(
             "can't lock joints",
@@ -210,11 +210,11 @@ class ArmModel(ABC):
 
     @property
     def payload_scale(self):
-        """Payload relative to that of the arm for which the mode shapes are made [-]."""
+        """Payload relative to that of the arm whose loads the mode shapes follow from [-]."""
         return self.origin[1]
 
     def _carrying(self, scale, model):
-        """The `model` that `with_payload` made, with its origin noted."""
+        """Set the origin of the `model` that `with_payload` made, and return it."""
         arm, already = self.origin
         model.origin = arm, already * scale
         return model
@@ -225,7 +225,7 @@ class ArmModel(ABC):
         Parameters
         ----------
         scale : float
-            0: no payload; its centre of mass stays where it is.
+            0: no payload. The payload's centre of mass stays where it is.
 
         Returns
         -------
@@ -246,7 +246,7 @@ class ArmModel(ABC):
         Parameters
         ----------
         modes : int
-            Number in every flexible direction. If fewer frequencies were measured, the arm has as many as it can.
+            Number in every flexible direction; as many as possible if fewer frequencies were measured.
         stiffens, finite_slope : bool
             Whether links keep their length, and whether their slopes may be large, see `levels`; for a chain only.
 
@@ -319,7 +319,7 @@ class ArmModel(ABC):
         q : ndarray, shape (n,), optional
             Joint angles; zero if not given.
         locked : bool
-            Joints locked, or free (rigid-body motions, of frequency zero, are left out).
+            True: the joints are locked. False: they are free; rigid-body motions, of frequency zero, are left out.
 
         Returns
         -------
@@ -334,7 +334,7 @@ class ArmModel(ABC):
         give = np.zeros((n, m))  # how the joints follow the modes
         if not locked:
             give = -np.linalg.solve(M[:n, :n], M[:n, n:])
-        # Joints free: the modal inertia that is left when the joints give way.
+        # With free joints: the modal inertia that remains when the joints follow the modes.
         mass = M[n:, n:] + M[n:, :n] @ give
         squares, vectors = eigh(K, 0.5 * (mass + mass.T)) if m else (np.zeros(0), np.zeros((0, 0)))
         return np.sqrt(np.maximum(squares, 0.0)), np.vstack([give @ vectors, vectors])
@@ -348,7 +348,7 @@ class ArmModel(ABC):
         return self
 
     def transmission_rates(self):
-        """Rate of the fastest transmission, among all and among those with play [rad/s]; 0 if there is none."""
+        """Rates of the fastest of all transmissions and of the fastest one with play [rad/s]; 0 if there is none."""
         return 0.0, 0.0
 
     def static_deflection(self, q):
@@ -357,7 +357,7 @@ class ArmModel(ABC):
         Raises
         ------
         ModelError
-            If there are none near the straight arm: it buckles or folds under its own weight.
+            If no such deflections are found near the straight arm: it buckles or folds under its own weight.
         """
         return self._rest(q)
 
@@ -405,10 +405,10 @@ class Stepper:
     arguments : tuple
         Their arguments after the number of substeps, except friction and data.
     data : object
-        What the right-hand side needs.
+        Argument of the right-hand side.
     lock : callable, optional
-        ``lock(mask)``: hold the joints of a boolean mask (n,) where they are, until the next call. They have to be at
-        rest, with zero torque.
+        ``lock(mask)``: hold the joints of a boolean mask (n,) where they are, until the next call. These joints must be
+        at rest, with zero torque.
 
     Attributes
     ----------
@@ -439,7 +439,7 @@ class Stepper:
         friction : ndarray, shape (n, 3), optional
             As `ArmModel.friction_table`, which is the default.
         change : ndarray, shape (n,), optional
-            Linear change of the torque until the end; zero if not given [N m].
+            Change of the torque from start to end, linear in time; zero if not given [N m].
         """
         change = self._none if change is None else change
         friction = self.friction if friction is None else friction
@@ -453,7 +453,7 @@ class Stepper:
         states : ndarray, shape (s + 1, 2 (n + m))
             Row k + 1 is `substeps` steps after row k.
         starts, ends : ndarray, shape (s, n)
-            Torque at both ends of each interval; linear between [N m].
+            Torque at both ends of each interval, linear in between [N m].
         step, substeps, friction
             As for `__call__`.
         """
@@ -492,9 +492,9 @@ def build(arm):
     Raises
     ------
     UnknownComponentError
-        When no installed package has a model of that name.
+        If no installed package has a model of that name.
     ModelError
-        When that model can't represent this arm.
+        If that model can't represent this arm.
     """
     return registry.find("flexarm.models", arm.model)(arm)
 
@@ -558,4 +558,4 @@ def damping_matrix(M22, K, ratios):
         raise ModelError(problem, field="modal stiffness", value=value)
     left = M22 @ psi
     D = left @ np.diag(2.0 * zeta * np.sqrt(squares)) @ left.T
-    return 0.5 * (D + D.T)  # to the last bit: two equal entries are one constant of recorded terms
+    return 0.5 * (D + D.T)  # exactly symmetric: recorded terms keep equal entries as one constant

@@ -20,8 +20,8 @@ Collecting terms gives the equations of `kernels.one_link` with, for :math:`\phi
     K_e &= \tfrac{EI}{L^3}\int\phi''\phi''^T, &
     \phi_e' &= \tfrac1L\,d\phi/d\xi|_1 .
 
-Foreshortening is not in this model: its centrifugal term softens (`K_e - qd^2 G`), where a beam that keeps
-its length would stiffen. Keep the joint's speed well below the first bending frequency.
+Foreshortening is not in this model. So the centrifugal term (`K_e - qd^2 G`) makes the beam softer; a beam that keeps
+its length would become stiffer. Keep the joint's speed well below the first bending frequency.
 """
 
 import math
@@ -39,7 +39,7 @@ from .model import ArmModel, Terms, damping_matrix, explicit_stepper, rotation
 
 SOURCES = (load.source(kernel), load.source(integrators))
 
-#: Cosine and sine of an angle that is not a number, as in numpy.
+#: Cosine and sine of an angle that is not finite, as in NumPy.
 NOWHERE = (math.nan, math.nan)
 
 
@@ -132,7 +132,7 @@ class OneLinkEquations(ArmModel):
     def terms(self, q, qd, delta=None, delta_d=None):
         c, constant = self.coefficients, self._terms_at_rest
         angle, speed = float(q[0]), float(qd[0])
-        # Plain numbers: numpy's functions of one number cost more than the rest of this.
+        # Python floats: NumPy's functions of a single number cost more than the rest of this method.
         gx, gy = self._gravity_plain
         cosine, sine = (math.cos(angle), math.sin(angle)) if math.isfinite(angle) else NOWHERE
         along, across = gx * cosine + gy * sine, gy * cosine - gx * sine
@@ -226,7 +226,7 @@ class OneLinkEquations(ArmModel):
         scalars, rigid = data[0], data[0][0]
 
         def lock(mask):
-            # A hub of infinite inertia: no acceleration at all.
+            # With infinite inertia the joint has no acceleration.
             scalars[0] = np.inf if mask[0] else rigid
 
         return self._stepper(method, data, lock)

@@ -16,7 +16,7 @@ and :math:`m\dot\theta^2\delta_i` in K2
 in m12 and m13                                 first gain -127.04 -> -127.56 lbf
 Gram matrix taken as the identity              nothing for R (clamped-free modes are orthonormal); for
                                                modes from measured frequencies int phi1 phi2 = 0.298
-:math:`m = \rho A L`, :math:`J_0 = mL^2/3`     printed values are rounded: last digit only
+:math:`m = \rho A L`, :math:`J_0 = mL^2/3`     published values are rounded: last digit only
 =============================================  ==========================================================
 
 For arms P3 and R only; for your own arm use `one_link.OneLink`.
@@ -32,8 +32,8 @@ from .one_link import Coefficients, OneLinkEquations
 class PaperAppendix(OneLinkEquations):
     r"""(A1)-(A8) for any number of modes.
 
-    ``m23_fit`` raises m23 (and m32). It is a fitted device with no physics, needed to reproduce the printed
-    gains (arm P3).
+    ``m23_fit`` is added to m23 and m32. It is a fitted number without physical meaning, needed to reproduce the
+    published gains (arm P3).
     """
 
     def __init__(self, arm, shapes=None):
@@ -51,7 +51,7 @@ class PaperAppendix(OneLinkEquations):
         L, M, Jp = link.length, payload.mass, payload.inertia[2][2]
         m, phi, slope = options["beam_mass"], self.phi_tip, self.slope_tip
         count = shapes.count
-        # (A2): the payload's terms alone depend on the deflections.
+        # (A2): only the payload's terms depend on the deflections.
         G = M * np.outer(phi, phi)
         M22 = m * np.eye(count) + G + Jp * np.outer(slope, slope)
         if count > 1:

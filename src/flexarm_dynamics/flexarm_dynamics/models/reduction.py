@@ -69,12 +69,12 @@ def of_link(chain, name, stations=17):
     Parameters
     ----------
     chain : Chain
-        To include the second order, its level must be above the first. That link must have no bodies, and its root must
+        To include the second order, its level must be above the first. The link must have no bodies, and its root must
         be at its joint.
     name : str
         Of the link.
     stations : int
-        Number of places along it, for pictures.
+        Number of places along the link, for pictures.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def _places(directions, modes, x, length):
 
 
 def _second_order(d, i, K):
-    """How a beam draws back: Psi_jk = -e_x int phi_j' phi_k' dx; and turns about its axis."""
+    """Foreshortening of a beam, Psi_jk = -e_x int phi_j' phi_k' dx, and its second-order rotation about its axis."""
     bends = d.direction[i, :K] != kernel.TWIST
     same = (d.direction[i, :K, None] == d.direction[i, None, :K]) & bends[:, None]
     slopes = d.node_slope[i, :, :K]

@@ -7,10 +7,10 @@ curvature may jump where EI does, and the shear force at a body. In bending the 
 
 .. math:: H_1 \ldots H_4, \qquad B_k(s) = \int\!\!\int P_k, \quad k = 2, 3, \ldots
 
-the cubics of Hermite and the twice integrated Legendre polynomials (value and slope zero at both ends, curvatures
-orthogonal); in torsion the two linear functions and :math:`\int P_k`, k = 1, 2 ... They converge exponentially; the
-degree is chosen for some twelve digits of the highest mode. Shapes are scaled to :math:`\int_0^1\phi^2d\xi = 1` and
-signed as those of `beam`.
+the Hermite cubics and the twice integrated Legendre polynomials (value and slope zero at both ends, curvatures
+orthogonal). In torsion they are the two linear functions and :math:`\int P_k`, k = 1, 2 ... They converge
+exponentially; the degree is chosen for about twelve digits of the highest mode. Shapes are scaled to
+:math:`\int_0^1\phi^2d\xi = 1` and signed as those of `beam`.
 
 Babuska, Szabo & Katz (1981), SIAM J. Numer. Anal. 18(3) (the p-version of the finite element method).
 """
@@ -24,7 +24,7 @@ from scipy.linalg import eigh
 
 from .beam import ModeShapes, _gauss_legendre
 
-#: Degree of the polynomials: the minimum, what each radian of the highest mode's wave adds, and the maximum.
+#: Degree of the polynomials: the minimum, the increase per radian of the highest mode's wave, and the maximum.
 MIN_DEGREE, DEGREE_PER_WAVE, MAX_DEGREE = 14, 1.4, 80
 
 
@@ -84,7 +84,7 @@ class VariedShapes:
     gram = ModeShapes.gram
 
     def _quadrature(self):
-        # Products of two shapes and of a section's stiffness.
+        # Enough points for products of two shapes and a section's stiffness.
         return spans(self.breaks, self.coefficients.shape[1] + 8)
 
 
@@ -127,7 +127,7 @@ def _trial(degree, twist):
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body on a beam, as bending in one direction, or twist, feels it.
+    """A rigid body on a beam, with its properties for bending in one direction, or for twist.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class Body:
         Of the section that carries it [-].
     mass, moment, inertia : float
         In units of the beam's m, m L, m L^2: its mass, mass times the distance of its centre of mass beyond the section
-        along the beam, and inertia about the section; in torsion the inertia alone, in units of the beam's own.
+        along the beam, and inertia about the section; in torsion only the inertia, in units of the beam's polar one.
     """
 
     place: float
@@ -166,7 +166,7 @@ class BeamProblem:
         degrees = self._degrees(modes)
         degree = max(degrees)
         K, M, rows = self._matrices(degrees)
-        # The largest mu of M v = mu K v belong to the lowest modes, so these keep all digits.
+        # The lowest modes have the largest mu of M v = mu K v, so they are accurate to all digits.
         _, vectors = eigh(M, K, subset_by_index=(len(M) - modes, len(M) - 1))
         vectors = vectors[:, ::-1]
         coefficients = np.zeros((len(degrees), degree + 1, modes))

@@ -76,6 +76,6 @@ def goes_first(own, other, simulates):
     own, other : tuple of str
         Namespace and name.
     simulates : bool
-        Whether the other is such a simulator, too; it would find the opposite.
+        Whether the other is such a simulator, too; it then decides the opposite.
     """
     return simulates and own < other

@@ -2,7 +2,7 @@
 """Node `hardware`: the simulated arm behind drives, as the hardware of third-party controllers.
 
 It receives and publishes `sensor_msgs/JointState` as ``joint_state_topic_hardware_interface`` of ros2_control needs
-them. It is a mock hardware whose links bend, and whose faults are chosen.
+them. It is mock hardware whose links bend, and into which faults can be put.
 """
 
 import time
@@ -36,7 +36,7 @@ OWN = (
     ),
 )
 PARAMETERS = (*simulator.PARAMETERS, *position_loop.PARAMETERS, *faults.PARAMETERS, *OWN)
-#: Lost real time is caught up at most by this [s].
+#: At most this much lost real time is caught up [s].
 BEHIND = 0.1
 
 

@@ -105,7 +105,7 @@ class Lockstep:
 
     def __init__(self, node):
         self._node = node
-        self._resent = 0  # times since the last step
+        self._resent = 0  # how often the state was sent again since the last step
         self.set_pause(node.parameters["pause_at"])
 
     def alone(self):
@@ -139,7 +139,7 @@ class Lockstep:
     def go_on(self):
         """Advance while there is no answer to wait for, because a fault held the message back.
 
-        The last torque acts on until it is too old.
+        The last torque acts until it is too old.
         """
         for _ in range(AT_ONCE):
             if self._node.paused or self._node.awaited is not None:
