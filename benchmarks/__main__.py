@@ -13,7 +13,7 @@ from pathlib import Path
 PEERS = ("mujoco", "exudyn", "control")
 INSTALL = "pip install -r requirements/bench.txt"
 
-#: Packages whose version is written down.
+#: Packages whose version is recorded.
 VERSIONS = ("numpy", "scipy", "numba", *PEERS)
 
 MISSED, MISSING = 1, 2
@@ -40,7 +40,7 @@ def parser():
 
 
 def missing():
-    """What can't be imported and how to get it, as text; empty when all is there."""
+    """Packages that can't be imported and how to install them, as text; empty if none is missing."""
     for names, remedy in ((("flexarm_dynamics",), ". tools/env.sh"), (PEERS, INSTALL)):
         absent = [name for name in names if not _imports(name)]
         if absent:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far the tip is off where bending stiffens: ``python -m benchmarks.accuracy``.
 
-Planar arms, simulated as one gets them without options, and at the first order, beside Exudyn's cables. These stretch
-a little, and are extrapolated to cables that do not: the strain is one over the axial stiffness. How far the stiffer of
-both is off from that shows how sure the reference is.
+Planar arms are simulated with the default options, and at the first order, and compared with Exudyn's cables. The
+cables stretch a little, in inverse proportion to their axial stiffness. Two of them are extrapolated to a cable that
+does not stretch, which is the reference. The distance of the stiffer cable from it shows the uncertainty of the
+reference.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ from .peers import Torque
 from .peers.exudyn_cable import ExudynCable
 
 GRAVITY, MODES, INTERVAL = 9.81, (3, 4), 1e-3
-#: Of the cables; their axial stiffness [N], the larger one first.
+#: Settings of the cables; their axial stiffness [N], the larger one first.
 FINE, AXIAL = {"elements": 12, "step": 1e-4, "rtol": 1e-6, "atol": 1e-5}, (1e8, 3e7)
 _TWO = {"L": 1.0, "rhoA": 0.2, "EI": 8.0, "Jh1": 0.05, "Jh2": 0.05, "Mm": 0.5, "Mp": 0.2, "Jp": 0.0}
 _THREE = cases.MORE["three_link_torque"]
@@ -53,13 +54,13 @@ CASES = (
     Case("three links, smooth torques", _THREE, "sine", tuple(Torque("three_link_torque", _THREE).sines), 4.0),
     Case("two links with payload, pulses", _TWO, "pulse", ((1.0, (0.4, 0.8)), (0.3, (0.4, 0.8))), 3.0),
     Case("two links that fall", _TWO, "sine", ((0.0, 1.0), (0.0, 1.0)), 2.0, GRAVITY),
-    # To 47 rad/s; the first frequency with the joint locked is 15.7.
+    # It reaches 47 rad/s; the first natural frequency with the joint locked is 15.7 rad/s.
     Case("one link, spun up to three times its first frequency", _ONE, "spin", ((3.916, 4.0),), 4.0),
 )  # fmt: skip
 
 
 def value(kind, law, t, before=False):
-    """A law's torque at a time; of a pulse, on an edge, `before` or after it [N m]."""
+    """Torque of a law at time `t` [N m]; at the edge of a pulse, the torque `before` or after the edge."""
     if kind == "sine":
         return law[0] * np.sin(law[1] * t)
     if kind == "spin":
@@ -131,13 +132,13 @@ class Cable(ExudynCable):
 
 
 def inextensible(case):
-    """Path of the tip of cables that do not stretch, extrapolated, and of the stiffer ones that it is made from [m]."""
+    """Path of the tip, extrapolated to cables that do not stretch, and the path with the stiffer cables [m]."""
     stiff, soft = (Cable(case, axial=axial, **FINE).tip() for axial in AXIAL)
     return stiff + (stiff - soft) * AXIAL[1] / (AXIAL[0] - AXIAL[1]), stiff
 
 
 def own(case, modes, level=None):
-    """Path of flexarm's tip (k, 2) [m], and the level that it took."""
+    """Path of flexarm's tip (k, 2) [m], and the model level that was used."""
     arm = cases.chain(case.parameters, modes=modes).arm
     arm = replace(arm, gravity=(0.0, -case.gravity, 0.0))
     arm = levels.simulated(arm) if level is None else levels.at_level(arm, level)
@@ -156,7 +157,7 @@ def own(case, modes, level=None):
 
 
 def off(path, reference):
-    """Largest distance of two paths [µm]."""
+    """Largest distance between two paths [µm], as text."""
     with np.errstate(over="ignore", invalid="ignore"):
         far = np.linalg.norm(path - reference, axis=1).max()
     return f"{1e6 * far:.3g}" if far < 1.0 else "diverges"

@@ -17,8 +17,8 @@ DATA = Path(__file__).resolve().parents[1] / "tests" / "data"
 #: Cases of this folder, whose trajectories `truth` made.
 OWN_DATA = Path(__file__).resolve().parent / "data"
 
-#: What the tip may be off by, for a code to take part [m]. Models of first order are off by 0.13 mm
-#: and 23 um in the first two cases, by 3.7 mm in the third one.
+#: Largest tip error with which a code takes part [m]. Models of first order have an error of 0.13 mm
+#: and 23 um in the first two cases, and of 3.7 mm in the third one.
 TARGETS = {
     "one_link_pulse": 5e-4,
     "two_link_torque_x0p1": 5e-5,
@@ -39,7 +39,7 @@ MORE = {
     },
 }  # fmt: skip
 
-#: Length of every case [s].
+#: Duration of every case [s].
 DURATION = 4.0
 
 
@@ -62,7 +62,7 @@ def reference(case):
 def chain(p, links=None, modes=2, foreshortening=False):
     """The project's model of a case's arm, a `Chain`; `p` is the case's entry of ``parameters.json``.
 
-    With another number of `links` the last one is repeated, or left out; each has so many `modes`.
+    For another number of `links`, the last link is repeated or left out. `modes` is the number of modes of each link.
     """
     if "GJ" in p:
         return _tubes(p, modes, foreshortening)
@@ -100,7 +100,7 @@ def chain(p, links=None, modes=2, foreshortening=False):
 
 
 def _tubes(p, modes, foreshortening):
-    """As `chain`, of the spatial arm."""
+    """As `chain`, for the spatial arm."""
     bends = {"modes": modes, "shape": "loaded"}
     hubs_of = [p["Jh1"], p["Jh2"]]
     joints = [

@@ -12,8 +12,8 @@ from . import cases, own
 from .peers import RATE, Torque, errors, steps_per_sample
 from .timing import least, paired, round_robin
 
-#: Package of this folder that holds a code, its class, and what it is: this project, a peer, or the
-#: loops that were written by hand for these arms alone.
+#: Module of each code, its class, and its kind: this project, a peer, or loops that were written by
+#: hand for these arms only.
 CODES = (
     (".own", "Flexarm", "own"),
     (".own", "FlexarmLoops", "own"),
@@ -37,7 +37,7 @@ BY_HAND = {
     "one link that stiffens": ("one_link_pulse", True),
 }
 
-#: Steps of the comparison with the hand-written loops [s].
+#: Step sizes of the comparison with the hand-written loops [s].
 SAME_STEPS = (1e-3, 1e-2)
 
 
@@ -48,9 +48,9 @@ class Effort:
     Attributes
     ----------
     rounds : int
-        Turns of each task.
+        Number of turns of each task.
     turn : float
-        Shortest turn [s].
+        Minimum duration of a turn [s].
     """
 
     rounds: int
@@ -58,13 +58,14 @@ class Effort:
 
 
 def all_codes(case, effort):
-    """One case in all codes, each with its own best settings.
+    """Run one case in all codes, each with its own best settings.
 
-    The time is that of `Peer.integrate`: torques and integration, no kinematics. Codes that miss
+    The time is that of `Peer.integrate`: torques and integration, without kinematics. Codes that miss
     the case's target are not timed.
 
-    Returns ``target`` [m] and ``codes``: name to kind, settings, errors, and, where the target is kept, ms per
-    simulated second (best and all turns) and its ratio to this project's (median over the turns, each beside its own).
+    Returns ``target`` [m] and ``codes``: name to kind, settings and errors. A code that meets the target also has its
+    time in ms per simulated second (best turn, and all turns) and the ratio of its time to this project's time (median
+    of the ratios of neighbouring turns).
     """
     parameters, found, tasks = cases.parameters(case), {}, {}
     for module, name, kind in CODES:
@@ -91,10 +92,10 @@ def all_codes(case, effort):
 
 
 def same_step(name, effort, steps=4000):
-    """The compiled loops alone, RK4 with the same steps, so many `steps` in one call, torques ready.
+    """Time the compiled loops alone: RK4, the same step size, `steps` steps in one call, torques computed beforehand.
 
-    `name` is in `BY_HAND`. For each of `SAME_STEPS`: ``step`` [s], ``generated`` and ``hand`` [ms per simulated second]
-    by the best turns, and their ``ratio``, the median over turns next to each other.
+    `name` is in `BY_HAND`, `effort` is an `Effort`. For each of `SAME_STEPS`: ``step`` [s], ``generated`` and ``hand``
+    [ms per simulated second] of the best turns, and ``ratio``, the median of the ratios of neighbouring turns.
     """
     case, stiffens = BY_HAND[name]
     parameters, result = cases.parameters(case), []
@@ -118,7 +119,7 @@ def same_step(name, effort, steps=4000):
 
 
 def _by_hand(chain, parameters, stiffens):
-    """Loops written by hand for a chain's equations, and their constants."""
+    """The hand-written loops for the equations of a chain, and their constants."""
     from .peers import hand_loops, hand_stiffening
     from .peers.numpy_equations import links
 

@@ -8,7 +8,7 @@ from .timing import paired
 
 
 def _fastest_peer(result):
-    """Ratio of the fastest peer's time to this project's, and its name; None where one has none."""
+    """Ratio of the fastest peer's time to this project's, and its name; None if no peer was timed."""
     codes = result["codes"]
     timed = [
         (c["ratio"], name) for name, c in codes.items() if c["kind"] == "peer" and "ratio" in c
@@ -17,10 +17,10 @@ def _fastest_peer(result):
 
 
 def check(summary):
-    """Criteria with their figures, for a `summary` as `__main__` writes it.
+    """Criteria with their measured values, for a `summary` as `__main__` writes it.
 
-    Each has ``text``, ``value``, ``limit``, ``least`` (True: the value must not be below the limit) and ``met``, None
-    where there is nothing to measure.
+    Each has ``text``, ``value``, ``limit``, ``least`` (True: the value must not be below the limit; False: not above
+    it) and ``met``, which is None if two cores were not available for a throughput measurement.
     """
     found = []
 

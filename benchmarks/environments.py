@@ -12,7 +12,7 @@ from flexarm_sim.environment import ArmVectorEnv
 from flexarm_studies import markdown
 
 ARMS = ("R", "two_link", "long_reach")
-#: Arms, time between two actions [s], actions that are timed, and turns, of which the median counts.
+#: Number of arms, time between two actions [s], number of timed actions, number of turns (the median is taken).
 COUNT, PERIOD, STEPS, TURNS = 64, 0.01, 10, 5
 
 

@@ -29,10 +29,10 @@ BEST = {
 
 
 def linear_torque(torque, intervals, length):
-    """The linear torques that do most nearly what a case's `torque` does over each of some intervals.
+    """Approximate a case's `torque` by a linear function of time in each interval.
 
-    Torque at the starts and the ends of the `intervals`, each (intervals, joints) [N m], which are of equal `length`
-    [s]; its mean is that of Simpson's rule.
+    Returns the torques at the starts and at the ends of the intervals, each (intervals, joints) [N m]. `intervals` is
+    their number, `length` the duration of each [s]. The mean over an interval equals that by Simpson's rule.
     """
     stages = torque.stages(intervals, length)
     start, middle, end = stages[:, 0], stages[:, 1], stages[:, 2]

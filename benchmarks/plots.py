@@ -35,13 +35,13 @@ def draw(summary, directory):
 
 
 def _plain(axis):
-    """Numbers on a logarithmic axis as one reads them, 0.1 and 10."""
+    """Write the numbers on a logarithmic axis as decimals: 0.1 and 10."""
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
 
 def _codes(cases):
-    """Bars: time of every code in every case."""
+    """Bar chart: time of every code in every case."""
     timed = {
         case: sorted(
             ((c["ms_per_s"], name, c) for name, c in result["codes"].items() if "ms_per_s" in c),
@@ -88,7 +88,7 @@ def _curves(axes, entries, over, label=lambda text: text, style="o-"):
 
 
 def _links(entries):
-    """Cost against links, with the line of costs in proportion to them."""
+    """Cost against the number of links, with a line of proportional cost."""
     figure, axes = plt.subplots(figsize=(6.4, 4.2))
     _curves(axes, entries, "links")
     last = entries[-1]
@@ -113,7 +113,7 @@ def _links(entries):
 
 
 def _modes(entries):
-    """Cost against modes per link for arms of one and two links."""
+    """Cost against the number of modes per link, for arms of one and two links."""
     figure, axes = plt.subplots(figsize=(6.4, 4.2))
     for links, style in ((1, "o-"), (2, "s--")):
         some = [entry for entry in entries if entry["links"] == links]

@@ -14,17 +14,18 @@ from . import cases, own
 from .peers import RATE, Torque
 from .timing import least, round_robin
 
-#: Step at which arms of every size are stable [s].
+#: Step size at which arms of every size are stable [s].
 TINY = 1e-6
 STAGES = METHODS["rk4"].weights.size
 
-#: Turns of one attempt, and the shortest turn [s]: both kinds of threads meet the same other load.
+#: Number of turns of one attempt, and minimum duration of a turn [s]. Both kinds of threads take turns, so that other
+#: programs load both equally.
 TURNS, TURN = 5, 0.25
 
 #: Attempts to find the machine idle, and the fraction of all cores that must be free.
 ATTEMPTS, ALL_THERE = 6, 0.9
 
-#: What the threads that share nothing work on.
+#: Data for the threads that share nothing.
 BLOCK = bytes(1 << 22)
 
 #: The case whose links the arms are made of.
@@ -32,10 +33,11 @@ CASE = "two_link_torque_x0p1"
 
 
 def costs(arms, effort, steps=200, foreshortening=False):
-    """Cost of one evaluation of the accelerations, in loops and in generated code, in calls of so many RK4 `steps`.
+    """Time one evaluation of the accelerations, in loops and in generated code; each call makes `steps` RK4 steps.
 
-    `arms` are pairs of links and modes per link. For each ``links``, ``modes``, and ``loops`` and ``generated``
-    [us per evaluation], the latter None where the project generates no code, by the best turns; ``turns`` of both.
+    `arms` are pairs: number of links, modes per link. Each result has ``links``, ``modes``, the times ``loops`` and
+    ``generated`` [us per evaluation] of the best turns, and ``turns`` of both. ``generated`` is None if the project
+    generates no code for the arm.
     """
     chains = {arm: cases.chain(cases.parameters(CASE), *arm, foreshortening) for arm in arms}
     tasks = {}
@@ -75,7 +77,7 @@ def _evaluations(chain, straight_line, steps):
 
 
 def core_counts(cores):
-    """Numbers of cores to measure: all up to four, then doubled, and all there are."""
+    """Numbers of cores to measure: each up to four, then doubled each time, and the number of all cores."""
     doubled = {2**k for k in range(cores.bit_length())}
     return sorted(n for n in {1, 2, 3, 4, cores} | doubled if n <= cores)
 
@@ -83,12 +85,12 @@ def core_counts(cores):
 def throughput(step=1e-3, runs=240):
     """Simulated seconds per second of `batch.simulate` against cores.
 
-    Other programs take cores away for whole seconds. So the best turn of each counts, and beside
-    the batches threads that share nothing show how many cores there were to be had.
+    Other programs may occupy cores for whole seconds. Therefore the best turn is taken, and threads that share
+    nothing, which take turns with the batches, measure how many cores were free.
 
-    A batch has so many `runs` from random states, with a `step` of RK4 [s]. Returns ``runs``, and ``cores``: a list
-    with ``cores``, ``throughput`` [s/s] and ``turns``, its ``speedup`` over one core, and ``available``, the same of
-    threads that share nothing.
+    A batch consists of at least `runs` runs from random states, by RK4 with a fixed `step` [s]. Returns ``runs``, and
+    ``cores``: a list with ``cores``, ``throughput`` [s/s], ``turns``, ``speedup`` over one core, and ``available``, the
+    speed-up of the threads that share nothing.
     """
     parameters = cases.parameters(CASE)
     chain = cases.chain(parameters)

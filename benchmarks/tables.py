@@ -5,7 +5,7 @@ from flexarm_studies.markdown import table
 
 
 def _settings(settings):
-    """Settings in short: the step first and in ms."""
+    """Settings as short text; the step comes first, in ms."""
     parts = []
     if "step" in settings:
         parts.append(f"{1e3 * settings['step']:.3g} ms")
@@ -22,7 +22,7 @@ def _number(value):
 
 
 def text(summary):
-    """All tables of what was measured: a `summary` as `__main__` writes it."""
+    """All tables of a `summary`, as `__main__` writes it."""
     lines = ["Times are those of the best turn, ratios the median of turns next to each other."]
     for case, result in summary["cases"].items():
         lines += _case(case, result)

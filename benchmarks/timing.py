@@ -8,9 +8,9 @@ import numpy as np
 
 
 def round_robin(tasks, rounds, turn):
-    """Measure tasks, by their names, in turns: time per call in each of so many `rounds` [s].
+    """Measure `tasks`, a mapping of names to functions, in turns; return the time per call in each of the `rounds` [s].
 
-    In a turn a task is called as often as takes at least `turn` [s].
+    In a turn, a task is called repeatedly for at least `turn` [s].
     """
     calls = {}
     for name, task in tasks.items():
@@ -31,10 +31,10 @@ def _elapsed(task, calls):
 
 
 def paired(times, over):
-    """Median of the ratios ``times / over`` of turns next to each other."""
+    """Median of the ratios ``times / over`` of neighbouring turns."""
     return float(np.median(times / over))
 
 
 def least(times):
-    """Time of the best turn: the work is always the same, so the others were disturbed."""
+    """Time of the best turn. The work is always the same, so slower turns were disturbed by other programs."""
     return float(np.min(times))

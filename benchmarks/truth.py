@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference trajectories of `cases.MORE`, of fine models in other codes: ``python -m benchmarks.truth``.
 
-Planar: Exudyn's cables, six elements a link, 0.5 ms. Spatial: MuJoCo's chains, eight hinges a link, 0.05 ms. Beside
-each a second model of the same arm, and how far its tip is off.
+Planar: Exudyn's cables with six elements per link, step 0.5 ms. Spatial: MuJoCo's chains with eight hinges per link,
+step 0.05 ms. For each, a second model of the same arm is simulated, and the distance of its tip is printed.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from .peers.mujoco_chain import MujocoChain
 from .peers.mujoco_tubes import MujocoTubes
 
 _FINE = {"elements": 6, "step": 5e-4, "axial": 1e6, "modified_newton": False}
-#: Of each case: the code of its reference with settings, and another.
+#: For each case: the code of the reference with its settings, and the code that is compared with it.
 CODES = {
     "three_link_torque": (
         (ExudynCable, _FINE),
@@ -28,7 +28,7 @@ CODES = {
 
 
 def main():
-    """Write the references, and print how far the other codes are off."""
+    """Write the references, and print the errors of the other codes."""
     for case, codes in CODES.items():
         p = cases.parameters(case)
         columns, other = (code(case, p, **given).run(cases.DURATION)[1] for code, given in codes)

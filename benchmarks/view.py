@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `flexarm view` costs the loop it looks on at: ``python -m benchmarks.view``, three minutes, in real time.
 
-Two loops on domains of their own, at one of which a view looks on, run in turns of a second and a half while the arm
-moves; from measurement to torque, as `flexarm latency` counts. The page has a client that takes all that a browser on
-another machine would, and draws nothing.
+Two loops run on separate domains, and a view is attached to one of them. They take turns of 1.5 s while the arm moves.
+The latency from measurement to torque is measured as in `flexarm latency`. A client of the page receives everything
+that a browser on another machine would receive, and draws nothing.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from benchmarks.latency import measure as latency
 
 ROUNDS = 12
 TWO_LINK = latency.Case("two_link", "two_link", 1000.0, (0.0, 0.0), (1.0, 1.0), 1.5, pace=0.25)
-#: Takes messages from the page's server as fast as they come, and says how many at the end.
+#: Receives messages from the page's server as fast as they come, and prints their number at the end.
 CLIENT = """
 import signal, sys, viser
 from websockets.sync.client import connect
@@ -34,7 +34,7 @@ with connect(sys.argv[1].replace("http", "ws"), subprotocols=[name], max_size=No
 
 
 def main(case, rounds=ROUNDS):
-    """Print percentiles of both, and their ratios turn by turn."""
+    """Print the latency percentiles of both loops, and their ratios turn by turn."""
     name = next(n for n in latency.CHAINS if n != "relay")
     windows = {"alone": [], "viewed": []}
     with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fuzzing command; see ``python -m fuzz --help``.
 
-hypothesis is not the runner here, though the unit tests use it: it gives the torque reader 300 inputs a second even
-where it draws a mere seed for each, the loop below 1600, with all checks. A million inputs must end within hours, and
-any of them must come again from its number alone.
+The unit tests use hypothesis, but this command does not. With all checks, hypothesis gives the torque reader 300 inputs
+per second, even if it draws only a seed for each; the loop below gives 1600. A million inputs must end within hours,
+and each must be reproducible from its number alone.
 """
 
 import argparse
@@ -67,12 +67,12 @@ def parser():
 
 
 NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
-#: A reader that fails so often is not asked any more.
+#: A reader that has failed this often gets no more inputs.
 ENOUGH = 100
 
 
 def fuzz(kind, inputs, seed):
-    """Give one reader so many inputs; a `Tally`.
+    """Give one reader a number of inputs; return the `Tally`.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def fuzz(kind, inputs, seed):
 
 
 def _kind(error):
-    """The kind of a failure, by which failures of one cause are grouped: numbers and names aside."""
+    """The kind of a failure, without numbers and names: it groups failures that have the same cause."""
     where = traceback.extract_tb(error.__traceback__)[-1]
     return type(error).__name__, where.filename, where.lineno, NUMBER.sub("#", str(error))[:24]
 
@@ -116,7 +116,7 @@ def _failure(reader, error, seed, number):
 
 
 def inputs_of(kinds, inputs):
-    """How many inputs each reader gets."""
+    """Number of inputs that each reader gets."""
     whole = sum(kind.weight for kind in kinds)
     return {kind: max(kind.batch, round(inputs * kind.weight / whole)) for kind in kinds}
 
@@ -163,7 +163,7 @@ def line(tally):
 
 
 def again(kind, seed, number):
-    """Run one input again, and let its error out."""
+    """Run one input again, and let its error propagate."""
     reader = kind()
     try:
         refused = reader.run(frame.generator(seed, kind.name, number))

@@ -36,7 +36,7 @@ LAST_STAMP = (2**31 - 1) * 10**9
 
 
 def healthy(arm, law, samples):
-    """Measured samples, and the estimates of them, of a loop that holds its arm."""
+    """Measured samples of a loop that holds its arm, and the estimates computed from them."""
     slow, fast, manifold = law
     loop = ClosedLoop(
         arm,
@@ -67,7 +67,7 @@ SETTLED = 120
 
 
 def _kept(sample):
-    """A sample as plain data, its own."""
+    """A copy of a sample as plain data."""
     out = {f: None if (v := getattr(sample, f)) is None else np.array(v) for f in FIELDS}
     return out | {"stamp_ns": sample.stamp_ns, "sequence": sample.sequence, "velocity_known": True}
 
@@ -111,7 +111,7 @@ def spoil(rng, sample, session):
 
 
 class _Path(Reader):
-    """One of a few objects lives through good samples, bad ones, and a new session that must heal it."""
+    """Gives an object good samples, bad ones, and then a new session, in which it must recover."""
 
     batch, GOOD, HEALING = 20, 4, 12
 
@@ -120,7 +120,7 @@ class _Path(Reader):
         self.session = 1
 
     def ready(self, key):
-        """An object, made when first asked for; with what a healthy session gives from it."""
+        """The object of a key. At the first call it is built, and the result of a healthy session is stored."""
         if key not in self.built:
             self.built[key] = self.build(key)
             self.wanted[key] = self.live(key, range(self.HEALING))
@@ -130,7 +130,7 @@ class _Path(Reader):
         self.built, self.wanted = {}, {}
 
     def live(self, key, steps):
-        """A session of good samples; what came out."""
+        """Run a new session of good samples; return the results."""
         self.session = self.session % (2**32 - 1) + 1
         return [self.good(key, k) for k in steps]
 
@@ -224,7 +224,7 @@ class Controllers(_Path):
         slow, fast, manifold = law
         made = design(arm_model, slow, fast, manifold, {"feedforward": feedforward})
         limits = {"torque_limit": [2.0], "torque_rate_limit": [500.0]}
-        limits["trajectory_torque_margin"] = 0.0  # motions at that limit, and beyond it
+        limits["trajectory_torque_margin"] = 0.0  # allow motions at that limit and beyond it
         settings = check_all(PARAMETERS, limits, sizes(arm_model))
         core = ArmController(arm_model, made, settings)
         return core, CompositeStateWriter(arm_model)
@@ -246,7 +246,7 @@ class Controllers(_Path):
         if rng.random() < 0.2:
             core.recover()
         enabled = core.step(sample)
-        if enabled is None:  # an old sample: it has had its answer
+        if enabled is None:  # an old sample: it was answered before
             demand(np.array_equal(core.torque, before), "an old sample has changed the torque")
             return 1
         demand(enabled == core.enabled, "two answers")
@@ -316,7 +316,7 @@ class Designs(Reader):
         lengths, out = sizes(self.models[arm]), {}
         for parameter in rng.sample(group, min(len(group), rng.choice((0, 1, 2)))):
             if parameter.name == "grid":
-                continue  # many designs: slow, and no other code
+                continue  # many designs: slow, and they run no other code
             value = Parameters.value(rng, parameter)
             if isinstance(value, list) and parameter.length and rng.random() < 0.8:
                 value = value[:1] or [1.0]

@@ -15,7 +15,7 @@ from flexarm_driver_template import protocol
 from flexarm_driver_template.device import MeasurementTime
 
 JOINTS, GAUGES = 2, 4
-#: No electronics counts further; a double holds every integer up to here.
+#: No electronics counts higher; a double represents every integer up to this one.
 MAX_COUNT = 2**53
 
 

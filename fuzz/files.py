@@ -76,7 +76,7 @@ class Models(Arms):
     error = FlexarmError
 
     def make(self, rng):
-        # Numbers alone: an arm of another structure compiles code of its own for seconds.
+        # Only numbers: for an arm of another structure, code is compiled for seconds.
         tree = copy.deepcopy(self.trees[rng.randrange(len(ARMS))])
         there = odd.places(tree)
         for path in rng.sample(there, min(len(there), rng.randint(1, 4) * 5)):
@@ -182,7 +182,7 @@ class Parameters(Reader):
 
     @staticmethod
     def value(rng, parameter):
-        """One near what is declared, or anything."""
+        """A value near the declared one, or anything."""
         if rng.random() < 0.4:
             return rng.choice(
                 (
@@ -314,7 +314,7 @@ class Csv(FileReader):
 
 
 def check_recording(made, arm):
-    """What an identification relies on."""
+    """Check what an identification relies on."""
     rows = len(made.position)
     demand(rows >= 20 and 0.0 < made.period < np.inf, f"{rows} rows of {made.period} s")
     demand(made.position.shape == (rows, len(arm.joints)), "position")
@@ -370,7 +370,7 @@ class Messages(Reader):
 
 
 class Driver(Reader):
-    """What ``check_driver`` says of a driver's messages: findings, never an error."""
+    """``check_driver`` on a driver's messages: it must return findings and never raise an error."""
 
     name, weight, error, ROWS = "check_driver", 0.5, (), 12
 

@@ -35,7 +35,7 @@ def arm_names(arm):
 
 
 def good_state(rng, arm):
-    """A state message that can be read, with values of its own."""
+    """A state message that can be read, with random values."""
     msg = ArmState()
     for field, given in arm_names(arm).items():
         setattr(msg, field, given)
@@ -98,12 +98,12 @@ def in_order(names, values, wanted):
 
 
 def same(array_, values):
-    """Equality of bits, NaN beside NaN."""
+    """Whether values are equal; NaN equals NaN."""
     return np.array_equal(array_, np.asarray(values), equal_nan=True)
 
 
 class States(Reader):
-    """`StateReader`: names in any order, lengths, everything beside."""
+    """`StateReader`: names in any order, lengths, and all other fields."""
 
     name, weight, error = "state message", 18.0, MessageError
     words = (
@@ -147,7 +147,7 @@ class States(Reader):
 
     def run(self, rng):
         refused = super().run(rng)
-        # Whatever came before, the next good one is read for what it is.
+        # Whatever came before, the next good message is read correctly.
         good = good_state(rng, self.arm)
         self.check(good, self.read(good))
         return refused
@@ -200,13 +200,13 @@ class Gate(Reader):
         sent = {}  # sequence -> when
         self.given = history = []
         names = {}  # sequence -> the controller that the state names
-        accepted = None  # when the state was sent whose torque was let through
+        accepted = None  # when the state was sent whose torque was accepted
         for _ in range(self.batch):
             now += rng.choice((0.0, 0.001, 0.01, 0.1, 2.0))
             if rng.random() < 0.7:
                 sequence = (sequence + rng.choice((1, 1, 1, 2))) % 2**32
                 sent[sequence] = now
-            if sequence in sent:  # sometimes again
+            if sequence in sent:  # sometimes it is sent again
                 names[sequence] = gate.sent(sequence, now)
             msg = good_torque(rng, self.arm)
             msg.sequence = sequence

@@ -37,14 +37,14 @@ FRACTIONS = {
 }
 #: Timeout of each wait [s].
 PATIENCE = 180.0
-#: After so many messages that get no answer, a service call checks that the node is alive.
+#: After this many messages, which get no answer, a service call checks that the node is alive.
 AT_ONCE = 5
 #: Number of times that a state without an answer is sent again.
 MAX_TRIES = 20
 
 
 class Nodes:
-    """Three nodes, and a program beside them that sends what it should not."""
+    """Three nodes, and this program, which sends them malformed messages."""
 
     def __init__(self, bench, seed):
         self.bench, self.random = bench, Random(f"{seed} nodes")
@@ -78,9 +78,9 @@ class Nodes:
     # Messages that are answered by the next node -----------------------------------------------------
 
     def states(self, topic, count, tally):
-        """States to the observer or the controller; each is answered by a torque."""
+        """Send states to the observer or the controller; each must be answered by a torque."""
         publisher = self.bench.publisher(ArmState, topic, 2)  # the tap is a reader, too
-        self.session += 10**6  # numbers from before are late ones, which nothing answers
+        self.session += 10**6  # earlier numbers are late samples, which get no answer
         for k in range(count):
             msg = good_state(self.random, self.description)
             set_stamp(msg.header.stamp, 10**9 + 10**6 * k)
@@ -89,14 +89,14 @@ class Nodes:
             # The answer shows that it was read; this number identifies it.
             msg.session, msg.sequence = self.session, k
             if self.random.random() < 0.02:
-                msg.session += 1 + k  # the source begins anew
+                msg.session += 1 + k  # the source has restarted
             publisher.publish(msg)
             key, tries = (msg.session, msg.sequence), [time.monotonic()]
 
             def answered(key=key, tries=tries, msg=msg):
                 if harness.answers(self.arm.torques, *key) or len(tries) > MAX_TRIES:
                     return True
-                if time.monotonic() > tries[-1] + 0.5:  # overtaken: only the newest one is kept
+                if time.monotonic() > tries[-1] + 0.5:  # replaced: only the newest one is kept
                     tries.append(time.monotonic())
                     publisher.publish(msg)
                 return False
@@ -122,7 +122,7 @@ class Nodes:
     # Messages without an answer ------------------------------------------------------------------------
 
     def torques(self, count, tally):
-        """Torques to the simulator, of its own session or not."""
+        """Send torques to the simulator, for its session or another one."""
         publisher = self.bench.publisher(JointTorque, "joint_torque", 2)
         for k in range(count):
             msg = spoil_torque(self.random, good_torque(self.random, self.description))
@@ -134,7 +134,7 @@ class Nodes:
             tally.inputs += 1
 
     def trajectories(self, count, tally):
-        """Trajectories to the controller."""
+        """Send trajectories to the controller."""
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
         joints = list(self.description.joint_names)
@@ -180,14 +180,14 @@ class Nodes:
                     wanted[node].append(prefix.replace("controller ", "") + p.name)
         out = {}
         for node, names in wanted.items():
-            # Where one name is not declared, there is no value in the answer.
+            # If one of the names is not declared, the answer contains no values.
             answer = self.bench.call(GetParameters, f"{node}/get_parameters", names=names)
             for name, value in zip(names, answer.values, strict=True):
                 out[node, name] = plain(value)
         return out
 
     def parameters(self, count, tally):
-        """Values of any type and size for the declared parameters."""
+        """Set declared parameters to values of any type and size."""
         groups = {k.replace(" ", ""): v for k, v in declared().items()}
         for _ in range(count):
             prefix = self.random.choice(tuple(groups))
@@ -212,7 +212,7 @@ class Nodes:
     # The end -----------------------------------------------------------------------------------------------
 
     def prove(self):
-        """The same processes hold the arm and follow a motion, with the parameters that they began with."""
+        """Check that the same processes hold the arm and follow a motion, with their initial parameters."""
         self.alive()
         for node in ("observer", "controller"):
             mine = {
@@ -254,7 +254,7 @@ class Nodes:
 
 
 def _sendable(value):
-    """Whether a message can hold a value; what rclpy does not check fails in C, where no handler catches it."""
+    """Whether a message can hold a value. rclpy does not check all; the rest fails in C, and can't be caught."""
     if isinstance(value, list):
         return all(
             type(v) is type(value[0]) and not isinstance(v, list) and _sendable(v) for v in value
@@ -265,7 +265,7 @@ def _sendable(value):
 
 
 def fuzz(count, seed, say):
-    """Give running nodes so many messages (`count`); a `Tally` of each kind, with which `say` is called as well."""
+    """Send `count` messages to running nodes; return a `Tally` of each kind, and call `say` with it."""
     tallies = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder, harness.Bench(folder) as bench:
         bench.patience = max(bench.patience, PATIENCE)
@@ -286,7 +286,7 @@ def fuzz(count, seed, say):
 
         part("trajectories", FRACTIONS["joint_trajectory"], nodes.trajectories)
         part("parameters", 1.0 - sum(FRACTIONS.values()), nodes.parameters)
-        # Stop the nodes that would answer beside this program.
+        # Stop the node that would answer as well as this program.
         bench.change("controller", "deactivate")
         part("torques", FRACTIONS["joint_torque"], nodes.torques)
         bench.change("controller", "activate")

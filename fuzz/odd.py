@@ -57,7 +57,7 @@ TEXTS = (
 
 
 def floating(rng, near=1.0):
-    """A float: often an odd one, else one of the size of `near`."""
+    """A float: often an odd one, otherwise one of the order of `near`."""
     if rng.random() < 0.6:
         return rng.choice(FLOATS)
     return near * rng.uniform(-3.0, 3.0) * 10.0 ** rng.randint(-3, 3)
@@ -71,7 +71,7 @@ def unsigned(rng):
 
 
 def text(rng, known=()):
-    """A text: an odd one, one that is known, or one that nearly is."""
+    """A text: an odd one, a known one, or one similar to a known one."""
     if known and rng.random() < 0.6:
         word = rng.choice(known)
         at = rng.randint(0, len(word))
@@ -110,7 +110,7 @@ def anything(rng, near=1.0, known=(), depth=2):
 
 
 def names(rng, given):
-    """Names in another order, or missing, twice, unknown, many."""
+    """The `given` names in another order, or with missing, repeated, unknown or too many names."""
     out, kind = list(given), rng.randrange(8)
     if kind < 2:
         rng.shuffle(out)
@@ -130,7 +130,7 @@ def names(rng, given):
 
 
 def floats(rng, values):
-    """An array of a message with odd values, or of another length."""
+    """An array of a message, with odd values or another length."""
     try:
         out, kind = array("d", values), rng.randrange(6)
     except (TypeError, OverflowError):  # spoilt already
@@ -148,7 +148,7 @@ def floats(rng, values):
 
 
 def mangled(rng, data):
-    """Bytes with a few of them changed, doubled, cut or put in."""
+    """Bytes of which a few are changed, doubled, removed or inserted."""
     data = bytearray(data)
     for _ in range(rng.randint(1, 4)):
         at, kind = rng.randint(0, len(data)), rng.randrange(6)
@@ -173,7 +173,7 @@ def mangled(rng, data):
 
 
 def places(tree, path=()):
-    """Paths of everything in lists and mappings, the containers too."""
+    """Paths of everything in lists and mappings, including the containers."""
     found = []
     items = tree.items() if isinstance(tree, dict) else enumerate(tree)
     for key, value in items:
@@ -184,7 +184,7 @@ def places(tree, path=()):
 
 
 def altered(rng, tree, known=()):
-    """Change a few places of a tree of lists and mappings, in place: other values, none, twice, other keys."""
+    """Change a few places of a tree of lists and mappings, in place: other, removed, repeated or new values or keys."""
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         there = places(tree)
         if not there:

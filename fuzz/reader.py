@@ -20,13 +20,13 @@ def demand(holds, what):
 
 
 class Reader:
-    """One reader: `make` an input, `read` it, `check` what came of it.
+    """One reader: `make` an input, `read` it, `check` the result.
 
     Attributes
     ----------
     name : str
     weight : float
-        Fraction of all inputs that it gets, before the weights are normalised [-].
+        Relative number of inputs that it gets; the weights are normalised afterwards [-].
     error : type
         The only errors that it may raise.
     words : tuple of str
@@ -46,18 +46,18 @@ class Reader:
         raise NotImplementedError
 
     def read(self, given):
-        """Have it read."""
+        """Give it to the code under test; return the result."""
         raise NotImplementedError
 
     def check(self, given, result):
         """Raise `Violation` unless what was read is valid."""
 
     def state(self):
-        """What a refused input must not change, as something that compares."""
+        """State that a refused input must not change; it must support comparison."""
         return None
 
     def run(self, rng):
-        """One batch; how many inputs were refused.
+        """Run one batch; return how many inputs were refused.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class Reader:
         return 0
 
     def check_message(self, error):
-        """A refusal says what is wrong, and where."""
+        """Check that a refusal says what is wrong, and where."""
         text = str(error)
         demand(text.strip(), f"a {type(error).__name__} without a word")
         demand(len(text) <= self.MAX_LENGTH, f"a message of {len(text)} characters: {text[:120]}…")
@@ -103,7 +103,7 @@ _SHORT.maxlevel = 5
 
 
 def show(value):
-    """An input as text, cut short."""
+    """An input as text, truncated."""
     try:
         text = _SHORT.repr(value)
         return text if len(text) < 2000 else f"{text[:2000]}…"

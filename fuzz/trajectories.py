@@ -23,7 +23,7 @@ WORDS = (*POINT_WORDS, "velocity", "points", "joint", "stamp", "trajectory", "li
 
 
 def good_points(rng, joints=JOINTS):
-    """Points as the controller hands them over: integer times, arrays of messages."""
+    """Points as the controller passes them on: integer times, arrays of messages."""
     n, fields = len(joints), rng.randint(1, 3)
     time, points = 0, []
     for _ in range(rng.randint(1, 5)):
@@ -63,7 +63,7 @@ def spoil_points(rng, points):
 
 
 def check_trajectory(made, joints, low, high, fastest):
-    """What the reference relies on."""
+    """Check what the reference relies on."""
     n, times = len(joints), made.times_ns
     demand(made.joint_names == tuple(joints), "joints")
     demand(times.dtype == np.int64 and times[0] >= 0, f"times {times}")
@@ -81,7 +81,7 @@ def check_trajectory(made, joints, low, high, fastest):
 
 
 class Points(Reader):
-    """`trajectory.validate`, with what a message holds and with what it can't."""
+    """`trajectory.validate`, with values that a message can hold and with others."""
 
     name, weight, error, words = "trajectory message", 16.0, TrajectoryError, WORDS
 
@@ -161,7 +161,7 @@ class Reference(Reader):
             made = trajectory.validate(JOINTS, JOINTS, stamp, [tuple(p) for p in points])
         except TrajectoryError:
             return 1
-        except TypeError:  # a point that is no sequence: `tuple` says so here, not the reader
+        except TypeError:  # a point that is no sequence: `tuple` raises it here, not the reader
             return 1
         before = (*_numbers(reference), reference.pending)
         verdict = reference.offer(made)
@@ -262,7 +262,7 @@ class Written(Reader):
             elif rng.random() < 0.3:
                 family = odd.text(rng, tuple(specs.FAMILIES))
         made = f"{family}:" + ",".join("=".join(item) for item in settings)
-        # Optimising a motion takes seconds: it is parsed here, not made.
+        # Optimising a motion takes seconds, so it is only parsed here.
         return made if not made.strip().startswith("least") else made + ",to"
 
     def read(self, given):

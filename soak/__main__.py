@@ -8,7 +8,7 @@ import time
 
 from flexarm_dynamics.errors import FlexarmError
 
-#: A process's memory may grow by this much: so much the allocator takes and gives back by itself [MiB].
+#: A process's memory may grow by this much, because the allocator's own use varies that much [MiB].
 FLAT = 8.0
 #: Timeout of each wait, on a busy machine [s].
 PATIENCE = 180.0
@@ -36,7 +36,7 @@ def parser():
 
 
 def soak(options, say):
-    """Run the rounds; the `Soak`, and why it ended early (empty if it did not)."""
+    """Run the rounds; return the `Soak`, and why it ended early (empty if it did not)."""
     from . import run
 
     with tempfile.TemporaryDirectory(prefix="soak-") as folder, run.harness.Bench(folder) as bench:

@@ -20,12 +20,12 @@ RUNNING = (
 
 
 class Invariants:
-    """Checks messages in their order of arrival; of earlier ones it keeps only what the checks need.
+    """Checks messages in order of arrival, and keeps only what later checks need.
 
     Parameters
     ----------
     limit, rate : ndarray, shape (n,)
-        Largest torque [N m], and change of it per second [N m/s].
+        Largest torque [N m], and its largest change per second [N m/s].
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Invariants:
     broken : Counter
         How often each invariant did not hold.
     first : dict of str to str
-        The first case of each.
+        The first failure of each invariant.
     """
 
     def __init__(self, limit, rate):

@@ -59,7 +59,7 @@ CHANGES = (
     {"slow__type": "no_such_law"},
     {"torque_limit": [1.0, 2.0, 3.0]},
 )
-#: What a healthy round starts from.
+#: Parameters with which a healthy round starts.
 HEALTHY = {
     "slow__kp": [6.25],
     "slow__kv": [5.0],
@@ -70,7 +70,7 @@ HEALTHY = {
 
 
 def resident(pid):
-    """Resident memory of a process [MiB]; 0 where it has ended."""
+    """Resident memory of a process [MiB]; 0 if it has ended."""
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     except OSError:
@@ -85,7 +85,7 @@ class Soak:
     ----------
     bench : harness.Bench
     seed : int
-        Of the motions, parameters and faults, and their order.
+        Seed of the motions, parameters and faults, and of their order.
     arm : str
     faults : bool
         Whether the simulator injects faults into its states.
@@ -179,7 +179,7 @@ class Soak:
         """Set the simulator's faults."""
         if not self.faults:
             return
-        # With its type, which an empty list does not show.
+        # The type is given, because an empty list does not show it.
         value = RosParameter("faults", RosParameter.Type.STRING_ARRAY, lines).to_parameter_msg()
         answer = self.bench.call(SetParameters, "simulator/set_parameters", parameters=[value])
         result = answer.results[0]
@@ -225,7 +225,7 @@ class Soak:
         self.seconds += seconds
 
     def prove(self):
-        """A healthy motion reaches its end."""
+        """Check that a healthy motion reaches its end."""
         self.begin(**HEALTHY)
         to, before = self.random.uniform(0.2, 0.4), self.arm.state.accepted_trajectory_id
         again = [0.0]
@@ -253,7 +253,7 @@ class Soak:
         self.shared.append(len(set().union(*(harness.segments(p) for p in self.pids.values()))))
 
     def growth(self):
-        """Growth of each process's memory after the warm-up (a third), from medians of thirds [MiB]; and of files."""
+        """Growth from the run's second third to its last: median memory of each process [MiB]; number of files."""
         if len(self.memory) < 6:
             return {}, 0
         third = len(self.memory) // 3

@@ -2,9 +2,9 @@
 """A random walk through the nodes' life: transitions, services, parameters and motions in any order, right and wrong.
 
 Simulator, observer and controller are in this process, joined by a queue (`tests/in_process.py`), in lockstep. Between
-two steps of the walk they exchange some messages. Nothing may be raised, every request has an answer, a wrong one
-changes nothing, and the torque keeps to its invariants. In the end the nodes are brought back, and a motion reaches its
-goal.
+two steps of the walk they exchange some messages. No exception may be raised, every request must be answered, a wrong
+request must change nothing, and the torque must satisfy its invariants. At the end all nodes are activated again, and a
+motion must reach its goal.
 """
 
 import random
@@ -29,7 +29,7 @@ import harness
 import in_process
 
 NODES = ("simulator", "observer", "controller")
-#: State: transitions that are possible in it, and where they lead; no shutdown, after which nothing follows.
+#: State to its possible transitions and their target states. Shutdown is left out, because nothing can follow it.
 POSSIBLE = {
     "unconfigured": {1: "inactive"},
     "inactive": {2: "unconfigured", 3: "active"},
@@ -61,7 +61,7 @@ SERVICES = (
     ("simulator/pause", SetBool, {"data": True}),
     ("simulator/pause", SetBool, {"data": False}),
 )
-#: Largest change of torque from one sample to the next, and largest torque that may begin after none [of its limit].
+#: Largest change of torque between samples, and largest first torque after none, as fractions of the limit [-].
 KICKS = {"between torques": 0.02, "after none": 0.03}
 #: How often each kind of step is taken, out of 100.
 WEIGHTS = {"transition": 25, "wrong transition": 15, "service": 15, "parameters": 15, "motion": 30}
@@ -80,8 +80,8 @@ class Walk:
     counts : Counter
         Steps taken, by kind; refusals.
     steps : dict of str to float
-        Largest change of the torque between two consecutive answers with torque, and largest torque that begins after
-        none, as fractions of the limit.
+        Largest change of the torque between two consecutive answers with torque, and largest first torque after none,
+        as fractions of the limit.
     """
 
     def __init__(self, seed, arm="R"):
@@ -94,7 +94,7 @@ class Walk:
         self.steps, self._last = dict.fromkeys(KICKS, 0.0), None
         simulator = {"lockstep": True, "pause_at": -1.0, "resend_period": 0.02}
         bench.start_loop(arm=arm, simulator=simulator)
-        # There is always something that happens, even while no node is configured.
+        # With this timer the queue always has an event, even while no node is configured.
         bench.queue.add_timer(0.01, lambda: None)
         self.state = {name: "active" for name in NODES}
         self.taps = {
@@ -144,7 +144,7 @@ class Walk:
         self.serve(self.random.choice((1, 5, 50, 300)))
 
     def transition(self):
-        """A transition that is possible; back to life more often than away from it."""
+        """Ask for a possible transition; those towards active are more frequent than those away from it."""
         away = [name for name in NODES if self.state[name] != "active"]
         back = bool(away) and self.random.random() < 0.8
         name = self.random.choice(away if back else NODES)
@@ -155,7 +155,7 @@ class Walk:
         assert self.lifecycle(name) == self.state[name]
 
     def wrong_transition(self):
-        """A transition that is not possible, by number or by name."""
+        """Ask for a transition that is not possible, by number or by name."""
         name = self.random.choice(NODES)
         here = self.state[name]
         if self.random.random() < 0.3:
@@ -170,7 +170,7 @@ class Walk:
         assert self.lifecycle(name) == here
 
     def change(self, name, number, label=""):
-        """Ask for a transition; whether it succeeded."""
+        """Ask for a transition; return whether it succeeded."""
         wanted = Transition(id=number, label=label)
         return self.bench.call(ChangeState, f"{name}/change_state", transition=wanted).success
 
@@ -179,7 +179,7 @@ class Walk:
         return self.bench.call(GetState, f"{name}/get_state").current_state.label
 
     def service(self):
-        """Call a service, where its node has it now."""
+        """Call a service, if its node offers it now."""
         name, kind, fields = self.random.choice(SERVICES)
         if self.state[name.split("/")[0]] != "unconfigured":
             answer = self.bench.call(kind, name, **fields)
@@ -196,7 +196,7 @@ class Walk:
     def motion(self):
         """Publish a motion that the torque limit allows, if the controller reads it.
 
-        One that asks for more changes the torque as fast as its budget allows, and would hide a kick.
+        A motion that needs more torque makes the torque change as fast as its budget allows, which would hide a kick.
         """
         if self.state["controller"] != "unconfigured":
             goal, time = self.random.uniform(-0.8, 0.8), self.random.uniform(2.0, 4.0)
@@ -225,7 +225,7 @@ class Walk:
         self.serve(100)
         arm.recover()
         arm.wait_ready()
-        # With velocity and acceleration: positions alone ask for jumps of velocity.
+        # With velocity and acceleration: positions alone would demand jumps of velocity.
         n = len(self.joints)
         arm.offer(harness.trajectory(self.joints, (2.0, [0.3] * n, [0.0] * n, [0.0] * n)))
         self.bench.wait_for(
@@ -240,7 +240,7 @@ class Walk:
 
 
 def walk(seed, steps, say, arm="R", every=500):
-    """Take so many steps; lines of a report, and whether all is well."""
+    """Take a number of `steps`; return the lines of a report, and whether all is well."""
     life = Walk(seed, arm)
     try:
         for k in range(steps):

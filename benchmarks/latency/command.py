@@ -14,8 +14,9 @@ from . import processor, redesign
 from .measure import CASES, CHAINS, measure, summary, table
 
 BEGIN, END = "<!-- latency: begin -->", "<!-- latency: end -->"
-#: A machine with more is too busy for a table: processes per CPU before the start, median of the bare relay [ms], and
-#: fraction of the relay's samples answered too late. On a quiet machine of two cores the last two are 0.7 ms and 0.04.
+#: A machine that exceeds one of these is too busy for a table: processes per CPU before the start, median of the bare
+#: relay [ms], and fraction of the relay's samples answered too late. On a quiet machine of two cores the last two are
+#: 0.7 ms and 0.04.
 MAX_LOAD, MAX_RELAY_MS, MAX_RELAY_LATE = 0.5, 1.5, 0.1
 
 
@@ -55,7 +56,7 @@ def add_arguments(parser):
 
 
 def chosen(options):
-    """Cases that the options ask for."""
+    """The cases that the options select."""
     arms, rates = options.arms.split(","), [float(r) for r in options.rates.split(",")]
     rates = [500.0] if options.quick else rates
     known_cases = CASES
@@ -70,14 +71,14 @@ def chosen(options):
 
 
 def too_busy(load, everything):
-    """Why the machine was too busy for a table; empty where it was not.
+    """Why the machine was too busy for a table; empty if it was not.
 
     Parameters
     ----------
     load : float
         Processes per CPU before the start.
     everything : list of dict
-        What was measured, case by case; the relay's rows show what the machine alone costs.
+        The measurements, case by case; the relay's rows show the latency of the machine and middleware alone.
 
     Returns
     -------
@@ -97,7 +98,7 @@ def too_busy(load, everything):
 
 
 def _table_of(everything, cases, options, title, measured):
-    """Measure case by case, and print as it goes; the table of all, whose figures are added to `everything`."""
+    """Measure case by case and print each table; return the table of all, and add its numbers to `everything`."""
     text, progress = "", Progress()
     for i, case in enumerate(cases):
         progress.step(f"{title}: {case.name}", i + 1, len(cases))
@@ -133,7 +134,7 @@ def _while_designing(case, options, progress):
 
 
 def latency(options):
-    """The sub-command."""
+    """Run the sub-command."""
     tables, everything = [], []
     cases, load = chosen(options), os.getloadavg()[0] / (os.cpu_count() or 1)
     again = [case for case in cases if case.rate == 500.0]

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""``flexarm latency``: from measurement to torque, in real time, beside a bare relay of the same messages.
 
-A loop is the shipped nodes in the shipped control, on the moving arm: simulator, observer and controller as three
-processes, or observer and controller in one. The relay (`flexarm_tools.running.relay`) is three plain nodes that answer
-each message with a ready-made one of the same type, size and quality of service; the same simulator, with the same
-plant, is at its head. Latency is counted in the simulator's process, on its steady clock, from just before the state's
-publish to the callback of the torque that answers it. Relay and loops take turns in short windows of one run, so that
-what slows the machine slows all of them, and the result is the ratio of each round's medians.
+A loop consists of the shipped nodes with the shipped control and a moving arm: simulator, observer and controller as
+three processes, or observer and controller in one. In the relay (`flexarm_tools.running.relay`), two plain nodes answer
+each message with a ready-made one of the same type, size and quality of service. The same simulator, with the same
+plant, sends the relay's states. Latency is measured in the simulator's process, on its steady clock: from just before
+the state is published to the callback of the torque that answers it. Relay and loops take turns in short windows of one
+run, so other load on the machine slows all of them. The result is the ratio of each round's medians.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from . import processor
 
 #: Percentiles of the latency.
 NAMES = ("p50", "p95", "p99")
-#: What takes turns: the processes beside the simulator, and whether they are the loop's.
+#: Chains that take turns: the processes beside the simulator, and whether they are nodes of the loop.
 CHAINS = {
     "relay": ("observer", "controller"),
     "three processes": ("observer", "controller"),
@@ -48,9 +48,9 @@ class Case:
     rate : float
         [Hz]
     begin, end : tuple of float
-        Ends of the motion [rad].
+        Endpoints of the motion [rad].
     window : float
-        Length of one window [s].
+        Duration of one window [s].
     pace : float
         Simulated seconds per second.
     """
@@ -65,7 +65,7 @@ class Case:
 
     @property
     def name(self):
-        """For tables."""
+        """Name of the case in tables."""
         pace = "" if self.pace == 1.0 else f" x {self.pace:g}"
         return f"{self.arm}, {self.rate:g} Hz{pace}"
 
@@ -79,13 +79,14 @@ LONG_REACH = {
 }
 CASES = (
     *(Case(**R, rate=rate, window=1.5) for rate in (200.0, 500.0, 1000.0)),
-    # A motion of this arm is planned for seconds at its receipt: one of two seconds serves all windows. It does not
-    # forgive a torque that is late by more than a period: slowed down, it is controlled on a busy machine, too.
+    # The controller plans a motion of this arm for seconds when it receives it, so one motion of two seconds serves all
+    # windows. The arm tolerates no torque that is late by more than a period, so the simulation runs slower than
+    # real time: the control then works on a busy machine, too.
     Case(**LONG_REACH, rate=500.0, window=1.6, pace=0.25),
 )
 
 
-#: A machine that comes too late is to show in the figures, not to have the arm stopped.
+#: Limits are opened: a machine that is too slow must show in the latencies, and must not stop the arm.
 OPEN = {
     "state_timeout": 60.0,
     "max_gap": 60.0,
@@ -121,7 +122,7 @@ class Chain:
                 period=0.05,
             )
         )
-        self.session.ask_again = self.PATIENCE  # a design takes long, and is to be made once
+        self.session.ask_again = self.PATIENCE  # a design takes long, and must be made only once
         self.wait_for = self.session.wait_for
 
     def _start(self, relay_spin):
@@ -142,7 +143,7 @@ class Chain:
                 start(role, timed, role, *arguments(given, file))
 
     def get_ready(self):
-        """Wait for the nodes; the first calls, which load code, are not measured."""
+        """Wait for the nodes. The first calls, which load code, are not measured."""
         for topic in ("arm_state", "arm_state_estimate", "joint_torque"):
             self.wait_for(
                 f"a publisher of {topic}", lambda t=topic: self.session.node.count_publishers(t)
@@ -157,7 +158,7 @@ class Chain:
         self.session.call(SetBool, "simulator/pause", data=paused)
 
     def offer(self, duration):
-        """Have the loop begin a motion of this duration [s] with its next window."""
+        """Offer a motion of this `duration` [s], which begins with the next window."""
         from trajectory_msgs.msg import JointTrajectory
 
         from flexarm_control.motions.profiles import quintic
@@ -178,7 +179,7 @@ class Chain:
         self.session.untap("controller/state")
 
     def window(self, seconds):
-        """Let it run for a while; what the simulator found."""
+        """Run for this number of `seconds`; return what the simulator measured."""
         before, meter = len(self.figures()), processor.Meter(self.processes.running)
         self.pause(False)
         time.sleep(seconds)
@@ -188,7 +189,7 @@ class Chain:
         return {**found[-1], "processor": taken}
 
     def figures(self):
-        """What the simulator found, one for each window so far."""
+        """What the simulator measured in each window so far."""
         return self._figures_of("simulator")
 
     def _figures_of(self, name):
@@ -203,13 +204,13 @@ class Chain:
         for name in logs:
             for times_of in self._figures_of(name):
                 for part, times in times_of.items():
-                    # The first ones wait for code to be loaded.
+                    # The first calls include the loading of code.
                     found[part] = statistics.median(times[20:] or times or [float("nan")])
         return found
 
 
 def measure(case, rounds, chains, relay_spin, moving, fraction):
-    """Windows of a case, in turns: chain to ``{"windows": [what the simulator found …], "mathematics": {part: s}}``.
+    """Measure a case in turns: chain to ``{"windows": [simulator's measurement …], "mathematics": {part: s}}``.
 
     Parameters
     ----------
@@ -222,7 +223,7 @@ def measure(case, rounds, chains, relay_spin, moving, fraction):
     moving : bool
         Whether the arm moves.
     fraction : callable
-        Called with the fraction that is done, 0 to 1.
+        Called with the fraction that is done, from 0 to 1.
     """
     out = {}
     with TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
@@ -234,7 +235,7 @@ def measure(case, rounds, chains, relay_spin, moving, fraction):
         for chain in made:
             out[chain.name] = {"windows": []}
         for i in range(rounds):
-            # In another order each time: none of them always comes first.
+            # The order changes each time, so that no chain always comes first.
             for chain in made[i % len(made) :] + made[: i % len(made)]:
                 out[chain.name]["windows"].append(chain.window(case.window))
             fraction((i + 1) / rounds)
@@ -244,19 +245,19 @@ def measure(case, rounds, chains, relay_spin, moving, fraction):
 
 
 def percentiles(windows):
-    """Latencies of each of the windows: `NAMES`, shape (windows, 3) [s]."""
+    """Percentiles `NAMES` of the latency in each window, shape (windows, 3) [s]."""
     return np.array([np.percentile(w["latencies"], (50.0, 95.0, 99.0)) for w in windows])
 
 
 def medians(values):
-    """Medians over the windows, of `values` as `percentiles` gives them, by `NAMES`."""
+    """Medians over the windows of `values`, as `percentiles` returns them, by `NAMES`."""
     return dict(zip(NAMES, np.median(values, axis=0).tolist(), strict=True))
 
 
 def summary(case, found):
-    """Rows of the table of one case, and what they are made of.
+    """Rows of the table of one case, and the numbers behind them.
 
-    `found` has the windows that were measured, by chain.
+    `found` is what `measure` returned.
 
     Returns
     -------

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The control path's nodes with a stopwatch, as `latency` starts them: ``python -m benchmarks.latency.nodes ROLE …``.
 
-The nodes are the shipped ones. The simulator stamps each state as it publishes it and each torque as it comes in,
-on one steady clock of one process; observer and controller time their one call of mathematics. What they found they
-print, a line of JSON at the end of each window (simulator) or of the process (the others).
+The nodes are the shipped ones. The simulator notes the time of each published state and of each received torque, on the
+steady clock of its process. Observer and controller time their one call of mathematics. Each prints its results as a
+line of JSON: the simulator at the end of each window, the others at the end of the process.
 """
 
 import json
@@ -18,7 +18,7 @@ from flexarm_sim.nodes import simulator
 
 
 class TimedSimulator(simulator.SimulatorNode):
-    """The simulator in real time, which is let go and paused for each window."""
+    """The simulator in real time. It runs for each window and is paused between windows."""
 
     def build(self):
         super().build()
@@ -47,7 +47,7 @@ class TimedSimulator(simulator.SimulatorNode):
             found = {
                 "latencies": self._latencies,
                 "enabled": self._latencies_enabled,
-                # No torque when the next period began: late, or never (the one under way aside).
+                # Samples without a torque when the next period began: late ones and lost ones, except the newest one.
                 "missed": late + max(len(self._pending) - 1, 0),
                 "lost": path.lost - self._lost_before if path else 0,
             }
@@ -58,16 +58,16 @@ class TimedSimulator(simulator.SimulatorNode):
 
 
 def timed(kind, key):
-    """Time `kind.step`, for new samples; what was found is printed at the end of the process."""
+    """Time `kind.step` for new samples. Returns a function that prints the times as JSON under `key`."""
     step, times, last = kind.step, [], [None]
 
     def stepping(self, sample, *more, **named):
         begin = perf_counter()
         result = step(self, sample, *more, **named)
         took = perf_counter() - begin
-        if sample.key != last[0]:  # one that was sent again is answered from the cache
+        if sample.key != last[0]:  # a sample that was sent again is answered from the cache
             last[0] = sample.key
-            if result:  # a controller that waits, or an observer that converges, does less
+            if result:  # a waiting controller or a converging observer does less work
                 times.append(took)
         return result
 
@@ -76,7 +76,7 @@ def timed(kind, key):
 
 
 def timed_law():
-    """Time `CompositeControl.step`, the mathematics in a controller's step; printed at the end of the process."""
+    """Time `CompositeControl.step`, the mathematics of a controller. Returns a function that prints the times."""
     step, times = CompositeControl.step, []
 
     def stepping(self, *state):
@@ -90,7 +90,7 @@ def timed_law():
 
 
 def main():
-    """Entry point of one process: ROLE, then what the node takes."""
+    """Entry point of one process; its arguments are ROLE, then those of the node."""
     role = sys.argv.pop(1)
     if role == "simulator":
         simulator.SimulatorNode = TimedSimulator

@@ -3,8 +3,9 @@
 
 ``PYTHONPATH=tests:$PYTHONPATH python -m benchmarks.latency.parts``
 
-The shipped nodes run in this process, joined by a queue (`tests/in_process.py`), in lockstep, while the arm moves. The
-times are medians over the samples, with warm caches; with ``--cold``, each node finds them filled with other data.
+The shipped nodes run in this process in lockstep, connected by a queue (`tests/in_process.py`), while the arm moves.
+The times are medians over the samples. The caches are warm; with ``--cold``, they are filled with other data before
+each node's call.
 """
 
 import argparse
@@ -42,14 +43,14 @@ PARTS = (
     (CompositeControl, "step", False, "- of this the law"),
     (CompositeControl, "look_ahead", False, "- look_ahead, after it"),
 )
-#: Length of the motion, of what is left out at its begin, and of what is measured [s].
+#: Duration of the motion, of its beginning that is left out, and of the part that is measured [s].
 MOTION, BEFORE, MEASURED = 4.0, 0.3, 1.5
-#: Bytes that ``--cold`` touches: more than the caches of one core hold.
+#: Data that ``--cold`` updates: more than the caches of one core hold.
 OTHERS = np.zeros(1 << 20)
 
 
 class Stopwatch:
-    """Replaces the methods of `PARTS` by ones that note how long they took, while it runs.
+    """Replaces the methods of `PARTS` by versions that record their duration while it is `running`.
 
     Parameters
     ----------
@@ -131,4 +132,4 @@ if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     main()
     sys.stdout.flush()
-    os._exit(0)  # what nodes of this process leave behind is no concern here
+    os._exit(0)  # skip the clean-up of the nodes in this process

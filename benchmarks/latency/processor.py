@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Processor time of each process in the windows of ``flexarm latency``, beside those of the bare relay.
 
-It is counted per sample that the simulator sends, as a busy machine sends fewer than the rate.
+It is given per sample that the simulator sends, because a busy machine sends fewer samples than the rate demands.
 """
 
 import time
@@ -15,15 +15,15 @@ ROLES = ("simulator", "observer", "controller")
 
 
 def spent(pid):
-    """Processor time of a process so far, all its threads, those that have ended included [s].
+    """Processor time of a process so far [s], of all its threads, including those that have ended.
 
-    From the process's CPU clock, the number of which is made of its `pid` as by clock_getcpuclockid of Linux.
+    It is read from the process's CPU clock. Its id is computed from the `pid` as clock_getcpuclockid does on Linux.
     """
     return time.clock_gettime((~pid << 3) | 2)
 
 
 class Meter:
-    """Processor time of several processes over a time.
+    """Measures the processor time of several processes from its creation on.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ class Meter:
         return {name: spent(pid) for name, pid in self._pids.items()}
 
     def taken(self):
-        """What each of them has taken since this meter was made [s]."""
+        """Processor time of each process since this meter was made [s]."""
         return {name: now - self._before[name] for name, now in self._spent().items()}
 
 
 def summary(windows, bare):
-    """Medians over the rounds of what the processes of a chain took.
+    """Medians over the rounds of the processor times of a chain.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ def summary(windows, bare):
     Returns
     -------
     each : dict of str to float
-        Of each process, per sample [ms].
+        Time of each process per sample [ms].
     ratio : float
-        Of all of them together, to all of the relay's in the same round.
+        Ratio of the time of all its processes to that of all the relay's processes in the same round.
     """
     mine, relay = ([_per_sample(w) for w in all_] for all_ in (windows, bare))
     each = {name: float(np.median([taken[name] for taken in mine])) for name in mine[0]}
@@ -69,7 +69,7 @@ def _per_sample(window):
 
 
 def table(rows):
-    """Markdown table of rows of `measure.summary`: milliseconds per sample, at 1 kHz that part of a core."""
+    """Markdown table of rows of `measure.summary`: ms per sample; at 1 kHz that is the fraction of a core."""
     head = ("arm, rate", "processor time [ms]", *ROLES, "together", "of the relay's")
     lines = []
     for row in rows:

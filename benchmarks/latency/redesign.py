@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm latency --redesign``: the same loop's latency while its fast law is designed anew, beside without.
 
-Three processes, the moving arm; windows without and windows in which parameters of the controller are set once in
-`EVERY` seconds take turns, and the result is the ratio of each round's percentiles. Each set is a whole design: gains,
-full-order check, feed-forward; or the Riccati gains over the workspace.
+The loop runs as three processes with a moving arm. Windows without changes take turns with windows in which controller
+parameters are set every `EVERY` seconds. The result is the ratio of each round's percentiles. Each setting causes a
+whole design: gains, full-order check and feed-forward, or the Riccati gains over the workspace.
 """
 
 import contextlib
@@ -20,9 +20,9 @@ from flexarm_studies import markdown
 
 from .measure import Chain, medians, percentiles
 
-#: From one set to the next [s].
+#: Time from one setting of parameters to the next [s].
 EVERY = 1.0
-#: Length of a window, and of the rest after one with designs [s].
+#: Duration of a window, and of the rest after a window with designs [s].
 WINDOW, REST = 3.0, 2.0
 
 NOTHING, ALPHA, GRID = "nothing", "`fast.alpha` set", "`scheduled_lqr` grid built"
@@ -30,16 +30,16 @@ NOTHING, ALPHA, GRID = "nothing", "`fast.alpha` set", "`scheduled_lqr` grid buil
 
 @dataclass(frozen=True)
 class Redesign:
-    """What is set in turns.
+    """Values of the parameters that are set in turns.
 
     Attributes
     ----------
     alphas : tuple of float
-        Of `fast.alpha`; the grids are built with the first.
+        Values of `fast.alpha`; the grids are built with the first.
     grids : tuple of int
-        Of `fast.grid`, with `fast.type` scheduled_lqr.
+        Values of `fast.grid`, with `fast.type` scheduled_lqr.
     reach : float
-        Of the grid, either side of the middle of the motion [rad].
+        Half-width of the grid, on either side of the middle of the motion [rad].
     """
 
     alphas: tuple
@@ -47,7 +47,7 @@ class Redesign:
     reach: float
 
 
-#: By arm.
+#: `Redesign` of each arm.
 REDESIGNS = {
     "R": Redesign((4.0, 5.0), (3, 4), 1.0),
     "long_reach": Redesign((0.0, 0.05), (3, 4), 0.3),
@@ -55,10 +55,10 @@ REDESIGNS = {
 
 
 def values_of(case):
-    """What is set in turns, by `ALPHA` and `GRID`: lists of name to value."""
+    """The settings for `ALPHA` and for `GRID`: lists of mappings of name to value."""
     redesign, middle = REDESIGNS[case.arm], 0.5 * (np.array(case.begin) + np.array(case.end))
     low, high = (middle + side * redesign.reach for side in (-1.0, 1.0))
-    # What a set leaves out stays as the last one had it: the grid has an alpha of its own.
+    # A parameter that is not set keeps its last value, so the grid's settings contain alpha, too.
     ends = {"fast.low": low.tolist(), "fast.high": high.tolist(), "fast.alpha": redesign.alphas[0]}
     return {
         ALPHA: [{"fast.type": "lqr", "fast.alpha": alpha} for alpha in redesign.alphas],
@@ -67,14 +67,14 @@ def values_of(case):
 
 
 class Setter:
-    """Sets parameters of the controller of a chain, one answer after the other."""
+    """Sets parameters of a chain's controller; each request waits for the answer to the one before."""
 
     def __init__(self, chain, case):
         self.chain, self.answers = chain, []
         self._values = {what: itertools.cycle(all_) for what, all_ in values_of(case).items()}
 
     def set(self, what):
-        """Ask for `ALPHA` or `GRID`; the `Question`."""
+        """Request the next setting of `ALPHA` or `GRID`; return the `Question`."""
         from rcl_interfaces.srv import SetParametersAtomically
 
         from flexarm_ros.session import parameter_messages
@@ -86,7 +86,7 @@ class Setter:
         )
 
     def window(self, what):
-        """One window with `what` set once in a while; what the simulator found."""
+        """Run one window in which `what` is set every `EVERY` seconds; return what the simulator measured."""
         chain, answer, due = self.chain, None, 0.0
         before = len(chain.figures())
         chain.pause(False)
@@ -103,7 +103,7 @@ class Setter:
         return chain.wait_for("the simulator's figures", lambda: chain.figures()[before:])[-1]
 
     def _wait_for_design(self):
-        """Let what is still being designed end, with the machine to itself: the next window is to be without."""
+        """Wait for designs that still run, while the loop is paused: the next window must be without them."""
         self.chain.session.serve(REST)
 
     def _take(self, answer):
@@ -113,9 +113,10 @@ class Setter:
 
 
 def measure(case, rounds, fraction):
-    """Windows of a case of an arm of `REDESIGNS`, in turns: what was done to what the simulator found in each window.
+    """Measure a case of an arm in `REDESIGNS`, in turns: kind of window to what the simulator measured in each.
 
-    `fraction` is called with the fraction that is done, 0 to 1. A value or a design that is refused is an error.
+    `rounds` is the number of rounds; `fraction` is called with the fraction that is done, from 0 to 1. A value or a
+    design that is refused is an error.
     """
     kinds = (NOTHING, ALPHA, GRID)
     found = {kind: [] for kind in kinds}
@@ -141,9 +142,9 @@ def measure(case, rounds, fraction):
 
 
 def summary(case, found):
-    """Rows of the table of one case: percentiles [ms], and the ratio of each round's to that without.
+    """Rows of the table of one case: percentiles [ms], and their ratio to those without designs in the same round.
 
-    `found` has the windows by what was done in them.
+    `found` has the windows by kind.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other ways to simulate the reference cases, to compare flexarm's accuracy and speed with.
 
-Every module has one or more classes with the interface of `Peer`. They import nothing of ROS; each
-imports its own third-party package at its top, so import only what is installed.
+Every module has one or more classes with the interface of `Peer`. They do not import ROS. Each module
+imports its own third-party package at its top, so import only modules whose package is installed.
 """
 
 import re
@@ -12,7 +12,7 @@ import numpy as np
 #: Rate at which every peer reports [Hz].
 RATE = 100
 
-#: Distance from a stage to a pulse's edge that still counts as on it [s].
+#: A stage that is no farther than this from a pulse's edge counts as on the edge [s].
 EDGE = 1e-9
 
 _SINE = re.compile(r"\s*([-+.\deE]+)\*sin\(2\*pi\*([.\deE]+)\*t\)\s*")
@@ -33,7 +33,7 @@ class Peer:
     case : str
         One of `cases.TARGETS`.
     parameters : dict
-        Of that case, see `cases.parameters`.
+        Parameters of that case, see `cases.parameters`.
     **settings
         The settings of the code: step, segments, tolerance.
     """
@@ -46,21 +46,22 @@ class Peer:
         self.torque = Torque(case, parameters)
 
     def integrate(self, duration):
-        """Simulate from rest for a `duration` [s]: torques and integration, the part whose time is compared.
+        """Simulate from rest for a `duration` [s]: torques and integration. The time of this part is compared.
 
         Returns the code's own result, for `report`.
         """
         raise NotImplementedError
 
     def report(self, result):
-        """Kinematics of what `integrate` returned, `RATE` a second, start and end included, each (n,).
+        """Kinematics of what `integrate` returned, sampled at `RATE`, start and end included; each has shape (n,).
 
-        By name: theta1, tip_x, tip_y, of a spatial arm tip_z, of two planar links elbow_x, elbow_y, alpha2 [rad, m].
+        Keys: theta1, tip_x, tip_y; for a spatial arm also tip_z; for two planar links also elbow_x, elbow_y, alpha2
+        [rad, m].
         """
         raise NotImplementedError
 
     def run(self, duration):
-        """Simulate from rest for a `duration` [s]: the times (n,) [s], and what `report` gives for them."""
+        """Simulate from rest for a `duration` [s]; return the times (n,) [s] and the `report` at these times."""
         return times(duration), self.report(self.integrate(duration))
 
 
@@ -74,7 +75,7 @@ class Torque:
     edges : tuple of float
         Times at which a torque jumps [s].
     level : tuple of float
-        Torque between the edges, one more than these [N m]; empty when nothing jumps.
+        Torques before, between and after the edges [N m], one more than edges; empty if no torque jumps.
     sines : list of tuple of float
         Amplitude [N m] and angular frequency [rad/s] of each joint's sine; empty for a pulse.
     """
@@ -94,13 +95,13 @@ class Torque:
                 self.sines.append((float(match[1]), 2.0 * np.pi * float(match[2])))
 
     def __call__(self, t):
-        """Torques [N m] at time t [s], shape (count,); on an edge the later level."""
+        """Torques [N m] at time t [s], shape (count,); on an edge, the level after it."""
         if self.edges:
             return np.array([self.level[sum(t >= edge for edge in self.edges)]])
         return np.array([a * np.sin(w * t) for a, w in self.sines])
 
     def sample(self, t):
-        """Torques [N m] at many times [s], shape (n, count); on an edge the mean of both levels."""
+        """Torques [N m] at many times [s], shape (n, count); on an edge, the mean of both levels."""
         t = np.asarray(t)
         if not self.edges:
             return np.stack([a * np.sin(w * t) for a, w in self.sines], axis=-1)
@@ -112,8 +113,8 @@ class Torque:
     def stages(self, steps, step):
         """Torques [N m] at each step's start, middle and end, shape (steps, 3, count).
 
-        A pulse's edge on a step's boundary is seen from inside the step: otherwise the last stage
-        of Runge-Kutta sees the torque of the next step and the method is of first order.
+        If a pulse's edge is on the boundary of a step, the level inside the step is used. Otherwise the last
+        stage of Runge-Kutta would use the torque of the next step, and the method would be of first order.
         """
         t = step * np.arange(steps)
         if not self.edges:
@@ -124,7 +125,7 @@ class Torque:
 
 
 def steps_per_sample(step):
-    """Steps between two reports; raises ValueError when the step does not divide the interval."""
+    """Number of steps between two reports; raises ValueError if the `step` does not divide the interval."""
     count = round(1.0 / (RATE * step))
     if count < 1 or abs(count * step * RATE - 1.0) > 1e-9:
         raise ValueError(f"a step of {step} s does not divide 1/{RATE} s")
@@ -137,9 +138,9 @@ def times(duration):
 
 
 def errors(columns, reference):
-    """Largest deviations of the `columns` of `Peer.run` from a reference at `RATE`, which may be longer.
+    """Largest deviations of the `columns` of `Peer.run` from a `reference` at `RATE`, which may be longer.
 
-    ``tip``: largest distance of tip from tip [m]; ``theta1``: largest deviation [rad].
+    ``tip``: largest distance between the tips [m]; ``theta1``: largest deviation [rad].
     """
     n = len(columns["theta1"])
 

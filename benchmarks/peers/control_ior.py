@@ -7,13 +7,13 @@ import numpy as np
 from . import RATE, times
 from .numpy_equations import _Numpy
 
-#: Version tried.
+#: Version that was tested.
 PINNED = "control==0.10.2"
 
 _LOOSE = {"method": "RK23", "rtol": 1e-2, "atol": 1e-4}
 
 #: Fastest settings that keep the tip within 0.5 mm (one_link_pulse) and 50 um
-#: (two_link_torque_x0p1); in two_link_torque the model is off by 3.7 mm. Scanned: RK45, RK23,
+#: (two_link_torque_x0p1); in two_link_torque the model's own error is 3.7 mm. Scanned: RK45, RK23,
 #: DOP853 and LSODA, rtol 1e-2 to 1e-4, atol 1e-3 to 1e-6. RK23 needs about half the evaluations of
 #: RK45 and DOP853 at these tolerances (897 of 1566 and 1374 in one_link_pulse). python-control's
 #: own RK45 with rtol 1e-3, atol 1e-6 takes twice as long.
@@ -37,7 +37,7 @@ class ControlResponse(_Numpy):
     rtol, atol : float
         Tolerances.
     method : str
-        Of `scipy.integrate.solve_ivp`; python-control's own choice is RK45.
+        Of `scipy.integrate.solve_ivp`; python-control's default is RK45.
     tip_mass, tip_inertia : float, optional
         As for `numpy_equations.links`.
     """

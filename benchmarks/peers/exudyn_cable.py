@@ -27,14 +27,14 @@ from exudyn.utilities import CreateSymbolicUserFunction
 
 from . import Peer, hubs, steps_per_sample, times
 
-#: Version tried; wheels for CPython 3.10 to 3.14.
+#: Version that was tested; wheels for CPython 3.10 to 3.14.
 PINNED = "exudyn==1.13.6"
 
 #: Fastest settings that keep the tip within 0.5 mm (one_link_pulse), 50 um (two_link_torque_x0p1)
 #: and 0.1 mm (two_link_torque). Scanned: 1 to 4 elements, steps of 10, 5 and 2.5 ms, axial 1e5 and
 #: 1e6, spectral radius 0.6 to 1, Newton's tolerances; a setting counts only if half its step keeps
-#: the target too. One element for one_link_pulse owes its accuracy to axial = 1e5 (0.8 mm with
-#: 1e6); two elements, which do not, take 0.50 instead of 0.39 ms per second.
+#: the target too. One element for one_link_pulse is accurate only with axial = 1e5 (0.8 mm with
+#: 1e6). Two elements do not depend on this; they take 0.50 instead of 0.39 ms per second.
 BEST = {
     "ExudynCable": {
         "one_link_pulse": {"elements": 1, "step": 1e-2, "rtol": 1e-4, "atol": 1e-6},
@@ -57,15 +57,15 @@ class ExudynCable(Peer):
     elements : int
         Cable elements per link.
     axial : float
-        EA [N]; the beams that the truth is of are inextensible.
+        EA [N]; the beams of the reference are inextensible.
     spectral_radius : float
-        Of generalised-alpha at infinite frequency.
+        Spectral radius of generalised-alpha at infinite frequency.
     rtol, atol : float
-        Newton's tolerances.
+        Tolerances of Newton's method.
     modified_newton : bool
-        Keep the Jacobian over steps.
+        Whether the Jacobian is kept over several steps.
     sparse : bool
-        Eigen's sparse solver in place of Exudyn's dense one.
+        Whether Eigen's sparse solver replaces Exudyn's dense one.
     """
 
     name = "Exudyn ANCF cable, generalised-alpha"
@@ -87,7 +87,7 @@ class ExudynCable(Peer):
         super().__init__(case, parameters, step=step, elements=elements)
         steps_per_sample(step)
         self.step, self.elements, self.axial = step, elements, axial
-        # Items refer to the container: it has to live as long as they do.
+        # Items refer to the container, so it must live as long as they do.
         self.container = exudyn.SystemContainer()
         self.system = self.container.AddSystem()
         self.functions = []

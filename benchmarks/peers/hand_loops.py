@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""The equations of `numpy_equations` as closed-form loops in numba: the least time they take.
 
-Everything that speeds up a loop written for these two arms only is in here:
+It contains everything that speeds up a loop written for only these two arms:
 
 - Scalars throughout, classical Runge-Kutta in its form for second-order systems.
 - Exact loaded modes make a last link's modal mass and stiffness diagonal, so its amplitudes are
   eliminated with constants.
 - Two links are integrated in :math:`(q_1, \delta_1, \alpha_2, \delta_2)` instead of
   :math:`(q_1, q_2, \delta_1, \delta_2)`; the two differ by a constant linear map, which Runge-Kutta
-  commutes with. In them all that depends on the bend reaches link 1 as a moment on its base and a
-  force on its tip: its amplitudes are eliminated with constants too, and of the 6 by 6 system there
-  remain one division for the tip force and one for the two rotations.
+  commutes with. In these coordinates, everything that depends on the bend acts on link 1 as a moment
+  on its base and a force on its tip. So its amplitudes are eliminated with constants, too. Of the
+  6 by 6 system, one division for the tip force and one for the two rotations remain.
 """
 
 from math import cos, sin
@@ -21,10 +21,10 @@ from numba import njit
 from . import RATE, Peer, steps_per_sample
 from .numpy_equations import equations, links
 
-#: A last link whose shapes are not orthogonal to this, relative to the diagonal, is refused.
+#: A last link whose mode shapes are not orthogonal within this tolerance, relative to the diagonal, is refused.
 ORTHOGONAL = 1e-9
 
-#: Scanned 1 to 10 ms. 10 ms, the longest step that the report's 100 Hz allow, is stable and keeps
+#: Scanned: 1 to 10 ms. 10 ms is the longest step that the report's 100 Hz allow. It is stable and keeps
 #: the tip within 0.13 mm (one_link_pulse) and 23 um (two_link_torque_x0p1), the model's own error.
 BEST = {
     "HandLoops": {
@@ -55,7 +55,7 @@ def one_link_constants(link):
 
 
 def two_links_constants(inner, outer):
-    """Constants of `two_links`, a tuple of floats, from two of `numpy_equations.Link`."""
+    """Constants of `two_links`, a tuple of floats, from two `numpy_equations.Link`, `inner` and `outer`."""
     _check_diagonal(outer.mass, "modal mass")
     _check_diagonal(outer.stiffness, "modal stiffness")
     gram1, gram2, mass2 = inner.gram, outer.gram, np.diag(outer.mass)
@@ -102,14 +102,14 @@ def two_links(k, q, x1, x2, al, y1, y2, r, v1, v2, s, u1, u2, torque1, torque2):
     along, across = fx * c - fy * z, fx * z + fy * c
     rr, ss = r * r, s * s
 
-    # Velocity parts of link 2's inertial force, turned into frame 1, and of the elbow's
+    # Velocity-dependent parts of link 2's inertial force, rotated into frame 1, and of the elbow's
     # acceleration.
     own_x, own_y = -2.0 * s * (h1 * u1 + h2 * u2) - ss * fx, -ss * fy
     force_x, force_y = c * own_x - z * own_y, z * own_x + c * own_y
     elbow_x, elbow_y = -2.0 * r * (e1 * v1 + e2 * v2) - rr * length, -rr * tip
     turned_x, turned_y = c * elbow_x + z * elbow_y, c * elbow_y - z * elbow_x
 
-    # Amplitudes of link 2 without the rotations and what they exert.
+    # Amplitudes of link 2 without the rotations, and the forces that they exert.
     bent1, bent2 = p11 * y1 + p12 * y2, p12 * y1 + p22 * y2
     f1 = ss * bent1 * b1 - o1 * y1 - h1 * b1 * turned_y
     f2 = ss * bent2 * b2 - o2 * y2 - h2 * b2 * turned_y
@@ -117,7 +117,7 @@ def two_links(k, q, x1, x2, al, y1, y2, r, v1, v2, s, u1, u2, torque1, torque2):
     moment2 = torque2 - 2.0 * s * (u1 * bent1 + u2 * bent2) - fx * turned_y + fy * turned_x - twist
     inertia2 = j2 + y1 * bent1 + y2 * bent2
 
-    # The same of link 1.
+    # The same for link 1.
     bent1, bent2 = g11 * x1 + g12 * x2, g12 * x1 + g22 * x2
     d1 = rr * x1 - w11 * x1 - w12 * x2 - sl1 * torque2
     d2 = rr * x2 - w21 * x1 - w22 * x2 - sl2 * torque2
@@ -172,7 +172,7 @@ def one_link_runner(accelerations):
 
     @njit
     def run(k, h, every, torque, out):
-        """Runge-Kutta 4 from ``out[0]``: (q, delta, rates) into every row, `every` steps apart."""
+        """Runge-Kutta 4 from ``out[0]``: writes (q, delta, rates) into the rows, `every` steps apart."""
         q, x, y, r, v, w = out[0]
         half, sixth = 0.5 * h, h / 6.0
         quarter, half2, sixth2 = half * half, half * h, h * h / 6.0
@@ -206,13 +206,13 @@ def one_link_runner(accelerations):
     return run
 
 
-#: From ``out[0]``: (q, delta, rates) into every row, `every` steps apart.
+#: Runge-Kutta 4 of one link from ``out[0]``: writes (q, delta, rates) into the rows, `every` steps apart.
 run_one = one_link_runner(one_link)
 
 
 @njit(cache=True)
 def run_two(k, h, every, torque, out):
-    """The same of two links: (q1, delta1, alpha2, delta2, rates)."""
+    """The same for two links: (q1, delta1, alpha2, delta2, rates)."""
     xa, xb, xc, xd, xe, xf, va, vb, vc, vd, ve, vf = out[0]
     half, sixth = 0.5 * h, h / 6.0
     quarter, half2, sixth2 = half * half, half * h, h * h / 6.0
@@ -283,14 +283,14 @@ class HandLoops(Peer):
         self.integrate(1.0 / RATE)  # compiles
 
     def simulate(self, start, torque):
-        """States from a given one under given torques.
+        """Simulate from a given state under given torques.
 
         Parameters
         ----------
         start : ndarray, shape (2n,)
-            (q, delta, rates); of two links (q1, q2, delta1, delta2, rates).
+            (q, delta, rates); for two links (q1, q2, delta1, delta2, rates).
         torque : ndarray, shape (steps, 3, joints)
-            At start, middle and end of each step [N m].
+            Torques at the start, middle and end of each step [N m].
 
         Returns
         -------

@@ -5,16 +5,16 @@ A link is a chain of rigid segments with a spring hinge between neighbours. With
 :math:`x_k` of a quadrature rule on the link and stiffness :math:`EI/(w_k L)` the chain's deflection
 under any static load is the quadrature of :math:`\int M(x)\dots/EI\,dx`, so
 
-- ``uniform``: equal cells with the hinge in each one's middle (half a segment is clamped in the
-  hub, half a segment is left at the tip), the midpoint rule. Its tip deflection under a tip force
-  is low by :math:`1/(4N^2)`, which the stiffness is corrected for.
+- ``uniform``, the midpoint rule: equal cells with a hinge in the middle of each. Half a segment is
+  clamped in the hub, and half a segment is left at the tip. The tip deflection under a tip force
+  would be too small by the fraction :math:`1/(4N^2)`; the stiffness is corrected for this.
 - ``gauss``: Gauss-Legendre nodes and weights. Deflection and slope under a tip force or moment are
-  exact from two hinges on, and the first frequencies converge much faster than those of equal
-  segments: of one_link_pulse's clamped link the first two are off by 2e-4 and -6e-2 with three
-  hinges, -4e-5 and 1e-3 with four; uniform, by 4e-3 and 4e-2 with four, 1e-3 and 9e-3 with eight.
+  exact from two hinges on. The first frequencies converge much faster than with equal segments. For
+  the clamped link of one_link_pulse, the errors of the first two are 2e-4 and -6e-2 with three
+  hinges, -4e-5 and 1e-3 with four; with ``uniform`` 4e-3 and 4e-2 with four, 1e-3 and 9e-3 with eight.
 
-The rigid segments carry the beam's mass where it is, rotary inertia of each as a rod. What moves is
-a chain of true rotations: foreshortening and large slopes are in it.
+Each rigid segment has the mass and the rotary inertia of a rod at its place on the beam. The chain
+makes true rotations, so foreshortening and large slopes are included.
 """
 
 import mujoco
@@ -23,14 +23,14 @@ from mujoco import rollout
 
 from . import RATE, Peer, hubs, steps_per_sample
 
-#: Versions tried: mujoco 3.17.0 (wheels for CPython 3.10 to 3.14; 4.0.0 has none for 3.10).
+#: Version that was tested: mujoco 3.17.0 (wheels for CPython 3.10 to 3.14; 4.0.0 has none for 3.10).
 PINNED = "mujoco==3.17.0"
 
 #: Fastest settings that keep the tip within 0.5 mm (one_link_pulse), 50 um (two_link_torque_x0p1)
-#: and 0.1 mm (two_link_torque). Scanned: both layouts, 2 to 6 hinges, steps of 10 ms over 1 to 80;
-#: a setting counts only if half its step keeps the target too (not asked of semi-implicit Euler in
-#: two_link_torque). Of the uniform layout, one_link_pulse takes 4 hinges and 5 ms (0.48 mm), x0p1 3
-#: and 5 ms (21 um).
+#: and 0.1 mm (two_link_torque). Scanned: both layouts, 2 to 6 hinges, steps of 10 ms divided by 1 to
+#: 80. A setting counts only if half its step keeps the target too (not required of semi-implicit Euler
+#: in two_link_torque). With the uniform layout, one_link_pulse needs 4 hinges and 5 ms (0.48 mm),
+#: two_link_torque_x0p1 3 hinges and 5 ms (21 um).
 BEST = {
     "MujocoChain": {
         "one_link_pulse": {"segments": 3, "step": 5e-3},
@@ -54,9 +54,10 @@ _OPTION = """
 
 
 def hinges(count, layout):
-    """Places and flexibilities of a link's hinges in a `layout`, ``uniform`` or ``gauss``.
+    """Positions and flexibilities of `count` hinges of a link in a `layout`, ``uniform`` or ``gauss``.
 
-    Positions along the link, of 0 to 1 [-], and flexibilities over that of the whole link, L/EI [-], each (count,).
+    Positions along the link from 0 to 1 [-], and flexibilities relative to that of the whole link, L/EI [-], each
+    (count,).
     """
     if layout == "uniform":
         places = (np.arange(count) + 0.5) / count
@@ -68,7 +69,7 @@ def hinges(count, layout):
 
 
 def _body(rod, points, spin):
-    """Mass, centre and inertia about it of a segment: a rod (mass, length) that starts at its frame.
+    """Mass, centre of mass and inertia about it of a segment: a `rod` (mass, length) that starts at its frame.
 
     `points` are masses and positions of point masses on it; `spin` is an inertia without mass.
     """
@@ -81,10 +82,10 @@ def _body(rod, points, spin):
 
 
 def chain(parameters, segments, layout, step, integrator):
-    """Model of a case as MJCF, with so many `segments`, hinges per link, in a `layout` of `hinges`.
+    """Model of a case as MJCF; `segments` is the number of hinges per link, `layout` as for `hinges`.
 
-    `integrator` is ``RK4`` or ``Euler`` (semi-implicit), `step` in s. Joints in order: base, link 1's hinges, elbow,
-    link 2's hinges.
+    `integrator` is ``RK4`` or ``Euler`` (semi-implicit); `step` is in s. Order of the joints: base, link 1's hinges,
+    elbow, link 2's hinges.
     """
     p = parameters
     length, rho, stiffness = p["L"], p["rhoA"], p["EI"]
@@ -106,7 +107,7 @@ def chain(parameters, segments, layout, step, integrator):
             else:
                 spring = stiffness / (float(weights[k - 1]) * length)
                 joint = f'<joint axis="0 0 1" stiffness="{spring!r}"/>'
-            # Only the inertia about z matters; three equal ones are always a legal body.
+            # Only the inertia about z matters; MuJoCo always accepts three equal ones.
             text.append(
                 f'<body pos="{offset!r} 0 0">{joint}<inertial pos="{centre!r} 0 0"'
                 f' mass="{mass!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>'
@@ -127,7 +128,7 @@ class MujocoChain(Peer):
     Parameters
     ----------
     step : float
-        Step [s]; divides 10 ms. The torque of each step is that of its middle.
+        Step [s]; divides 10 ms. The torque in each step is that at its middle.
     segments : int
         Hinges per link.
     layout : str
@@ -180,7 +181,7 @@ class MujocoChain(Peer):
 
 
 class MujocoChainEuler(MujocoChain):
-    """The same with MuJoCo's semi-implicit Euler."""
+    """`MujocoChain` with MuJoCo's semi-implicit Euler."""
 
     integrator = "Euler"
     name = "MuJoCo rollout, semi-implicit Euler"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """MuJoCo model of a spatial arm of two tubes, as chains of rigid segments.
 
-As `mujoco_chain` in its layout ``gauss``, with three hinges at each node: two for the bending, one for the twist. Their
-order matters in second order of a node's angles, less with more nodes.
+It is like `mujoco_chain` with the layout ``gauss``, but has three hinges at each node: two for bending, one for twist.
+The effect of their order is of second order in a node's angles, and smaller with more nodes.
 """
 
 import mujoco
@@ -10,8 +10,8 @@ import numpy as np
 
 from .mujoco_chain import MujocoChain, hinges
 
-#: Fastest settings that keep the tip within 50 um; scanned: 2 to 4 segments, steps of 10 ms over 2 to 50. A setting
-#: counts only if half its step keeps the target too.
+#: Fastest settings that keep the tip within 50 um; scanned: 2 to 4 segments, steps of 10 ms divided by 2 to 50. A
+#: setting counts only if half its step keeps the target too.
 BEST = {"MujocoTubes": {"spatial_torque": {"segments": 3, "step": 6.25e-4}}}
 
 _MODEL = """
@@ -65,7 +65,7 @@ def arm(parameters, segments, step):
 
 
 class MujocoTubes(MujocoChain):
-    """Hinge chain in space under `mujoco.rollout`; settings as those of `MujocoChain`."""
+    """Hinge chain in space under `mujoco.rollout`; settings as for `MujocoChain`."""
 
     name = "MuJoCo rollout in space, RK4"
 

@@ -2,8 +2,8 @@
 r"""First-order assumed-modes equations of one and two planar links, as one writes them in numpy.
 
 A point of a link is at :math:`(x, y(x))` in the frame of its base, :math:`y =
-\sum_i\phi_i(x/L)\delta_i`; the bending is of first order (no foreshortening, slope as angle), the
-kinetic energy of these kinematics is kept whole. Link 2 starts at the tip of link 1 and is turned
+\sum_i\phi_i(x/L)\delta_i`; the bending is of first order (no foreshortening, slope as angle), and
+no term of the kinetic energy of these kinematics is neglected. Link 2 starts at the tip of link 1 and is turned
 by :math:`\alpha_2 = q_1 + y_1'(L) + q_2`. Its hub's inertia turns with :math:`\dot\alpha_2`; with
 :math:`\alpha_2` in place of :math:`q_2` the coupling of the links is one first moment at the elbow.
 
@@ -23,8 +23,8 @@ from . import Peer, steps_per_sample, times
 MODES = 2
 
 #: Fastest settings that keep the tip within 0.5 mm (one_link_pulse) and 50 um
-#: (two_link_torque_x0p1), where the model itself is off by 126 and 23 um. In two_link_torque it is
-#: off by 3.7 mm, whatever the settings. Scanned: steps of 10, 5, 2.5 and 1 ms; rtol 0.1 to 1e-6
+#: (two_link_torque_x0p1), where the model's own errors are 126 and 23 um. In two_link_torque its
+#: error is 3.7 mm with any settings. Scanned: steps of 10, 5, 2.5 and 1 ms; rtol 0.1 to 1e-6
 #: with atol 1e-3 to 1e-8.
 BEST = {
     "NumpyRk4": {
@@ -50,26 +50,26 @@ class Link:
     hub : float
         Inertia that turns with the base [kg m^2].
     tip_mass, tip_inertia : float
-        What moves with the tip and turns with its tangent [kg, kg m^2].
+        Mass that moves with the tip, and inertia that turns with its tangent [kg, kg m^2].
     shapes : ModeShapes
         Shape functions.
 
     Attributes
     ----------
     inertia : float
-        Of the straight link about its base, hub included [kg m^2].
+        Inertia of the straight link about its base, hub included [kg m^2].
     coupling : ndarray, shape (m,)
-        Mass between base rotation and amplitudes [kg m].
+        Mass coupling between base rotation and amplitudes [kg m].
     mass : ndarray, shape (m, m)
         Modal mass [kg].
     gram : ndarray, shape (m, m)
-        The same without the tip's inertia: what centrifugal terms need [kg].
+        Modal mass without the tip's inertia, for the centrifugal terms [kg].
     stiffness : ndarray, shape (m, m)
         Modal stiffness [N/m].
     total, first_x : float
         Mass [kg] and first moment along the link [kg m], without the hub.
     first_y : ndarray, shape (m,)
-        First moment across per amplitude [kg].
+        First moment across the link per amplitude [kg].
     tip, slope : ndarray, shape (m,)
         Tip deflection [-] and slope [1/m] per amplitude.
     """
@@ -100,8 +100,9 @@ def links(parameters, tip_mass=None, tip_inertia=None):
     parameters : dict
         Entry of ``parameters.json``.
     tip_mass, tip_inertia : float, optional
-        Load on which the shapes of a two-link arm's first link rest [kg, kg m^2]; by default elbow,
-        second link and payload, and the second hub's inertia. It changes shapes, not masses.
+        Tip load that is assumed for the mode shapes of a two-link arm's first link [kg, kg m^2]; by
+        default elbow, second link and payload, and the second hub's inertia. It changes the shapes, not
+        the masses.
 
     Returns
     -------
@@ -156,7 +157,7 @@ class OneLink:
         return np.linalg.solve(self.mass, force)
 
     def columns(self, states):
-        """Report columns of states, shape (n, 6)."""
+        """Report columns of `states`, shape (n, 6)."""
         q, tip = states[:, 0], states[:, 1:3] @ self.link.tip
         cos, sin, length = np.cos(q), np.sin(q), self.link.length
         return {"theta1": q, "tip_x": length * cos - tip * sin, "tip_y": length * sin + tip * cos}
@@ -175,7 +176,7 @@ class TwoLinks:
 
     def __init__(self, inner, outer):
         self.inner, self.outer = inner, outer
-        # Order within: q1, delta1, alpha2, delta2.
+        # Internal order: q1, delta1, alpha2, delta2.
         self.mass = np.zeros((6, 6))
         self.mass[0, 1:3] = self.mass[1:3, 0] = inner.coupling
         self.mass[1:3, 1:3] = inner.mass
@@ -206,12 +207,12 @@ class TwoLinks:
         mass[1:3, 4:] = self.corner * cos
         mass[4:, 1:3] = mass[1:3, 4:].T
 
-        # Velocity parts: of link 2's inertial force in its own frame and then in that of link 1,
+        # Velocity-dependent parts: of link 2's inertial force in its own frame, then in that of link 1,
         # ...
         own_x = -2.0 * alpha_rate * first_rate - alpha_rate**2 * b.first_x
         own_y = -(alpha_rate**2) * first
         force_x, force_y = cos * own_x - sin * own_y, sin * own_x + cos * own_y
-        # ... of the elbow's acceleration in the frame of link 1 and then in that of link 2.
+        # ... of the elbow's acceleration in the frame of link 1, then in that of link 2.
         elbow_x = -2.0 * rate1 * tip_rate - rate1**2 * a.length
         elbow_y = -(rate1**2) * tip
         turned_x, turned_y = cos * elbow_x + sin * elbow_y, -sin * elbow_x + cos * elbow_y
@@ -264,14 +265,14 @@ def equations(parameters, tip_mass=None, tip_inertia=None):
 
 
 class _Numpy(Peer):
-    """What both integrators share.
+    """Base class of both integrators.
 
     Parameters
     ----------
     tip_mass, tip_inertia : float, optional
         As for `links`.
     **settings
-        Of the integrator.
+        Settings of the integrator.
     """
 
     def __init__(self, case, parameters, *, tip_mass=None, tip_inertia=None, **settings):
@@ -279,11 +280,11 @@ class _Numpy(Peer):
         self.arm = equations(parameters, tip_mass, tip_inertia)
 
     def pieces(self, duration):
-        """Start and end of each smooth piece of the torque [s], and its torque there; None for a sine."""
+        """Start and end of each smooth piece of the torque [s], and the constant torque there; None for a sine."""
         for start, end in pairwise(
             (0.0, *(e for e in self.torque.edges if e < duration), duration)
         ):
-            # Held: the last stage of a piece must not see the next level.
+            # Constant: the last stage of a piece must not use the next level.
             yield start, end, self.torque(0.5 * (start + end)) if self.torque.edges else None
 
     def derivative(self, state, torque):

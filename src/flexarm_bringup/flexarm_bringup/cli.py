@@ -59,7 +59,7 @@ class Command:
 
 
 def _find_benchmarks():
-    """The benchmarks are part of a checkout, not of an installed package."""
+    """Make the benchmarks importable: they are part of a checkout, not of an installed package."""
     root = os.environ.get("FLEXARM_ROOT", "")
     if not os.path.isdir(os.path.join(root, "benchmarks")):
         hint = "run this command as ./flexarm in a checkout of flexarm"
@@ -210,7 +210,7 @@ COMMANDS = {
 
 
 class Help(argparse.HelpFormatter):
-    """Leaves examples as they are, a line each, to be copied; fills the rest."""
+    """Leaves examples as they are, one per line, to be copied; wraps all other text."""
 
     def _fill_text(self, text, width, indent):
         lines = []
@@ -243,7 +243,7 @@ def parser(only=None):
 
 
 def refuse_unknown(name):
-    """End with wrong usage where a command is none, and name the one that may be meant."""
+    """Exit as for wrong usage if there is no such command, and suggest a similar one."""
     if not name or name.startswith("-") or name in COMMANDS:
         return
     near = difflib.get_close_matches(name, COMMANDS, 1)
@@ -256,7 +256,7 @@ ANGLES = ("--at", "--initial", "--to", "--from", "--tip", "--via")
 
 
 def bind_angles(words):
-    """Join ``--at -1,2`` to ``--at=-1,2``: argparse would take the angles for an option."""
+    """Join ``--at -1,2`` to ``--at=-1,2``: argparse would read the angles as an option."""
     out = []
     for word in words:
         if out and out[-1] in ANGLES and re.match(r"-[\d.]", word):
@@ -278,7 +278,7 @@ def main(argv=None):
     """Entry point; exit code 0, 1 for an error that has been reported, 2 for wrong usage."""
     words = bind_angles(sys.argv[1:] if argv is None else argv)
     name = words[0] if words else ""
-    # As Ctrl-C: what was started is stopped on the way out.
+    # Like Ctrl-C: started processes are stopped on the way out.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         refuse_unknown(name)

@@ -29,7 +29,7 @@ _NOTHING = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"Creati
 
 
 def save(figure, *paths, **options):
-    """Write a figure to each of the `paths`, their folders made, and close it; the first path.
+    """Write a figure to each of the `paths`, making their folders, and close it; return the first path.
 
     `options` are those of `savefig`.
     """

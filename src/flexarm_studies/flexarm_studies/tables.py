@@ -167,7 +167,7 @@ class Steps:
 
 
 class Motion:
-    """Joint motion through the `positions` (k, n) at `times` (k,): a spline of degree five, or three below six rows.
+    """Joint motion through the `positions` (k, n) at `times` (k,): a spline of degree five; three below six rows.
 
     `where` is the file, for messages.
     """
@@ -189,7 +189,7 @@ class Motion:
 
 
 def write(columns, rows, path=None):
-    """Write rows as CSV, with twelve significant digits, to a file, its directory made, or to standard output."""
+    """Write rows as CSV with twelve significant digits, to a file, whose directory is made, or to standard output."""
     out = io.StringIO()
     np.savetxt(out, rows, fmt="%.12g", delimiter=",", header=",".join(columns), comments="")
     if path is None:

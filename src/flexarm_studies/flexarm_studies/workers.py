@@ -24,7 +24,7 @@ def add_arguments(add, what=""):
 
 
 def results(function, calls, workers=None, scheduler=None):
-    """Yield (i, ``function(*calls[i])``), as they come.
+    """Yield (i, ``function(*calls[i])``), as the results come.
 
     Parameters
     ----------

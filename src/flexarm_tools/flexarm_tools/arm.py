@@ -37,7 +37,7 @@ from .running.processes import Processes, own_domain
 JOIN, MUST_JOIN = 2.0, 15.0
 #: A goal without an answer is sent again after this time; the arm has this long to stop after Ctrl-C [s].
 AGAIN, STOPPING = 3.0, 10.0
-#: Longer than any motion: the end of a motion is awaited as long as the nodes are there [s].
+#: Longer than any motion: there is no timeout for the end of a motion as long as the nodes run [s].
 FOR_EVER = 1e9
 STATES = {
     getattr(CompositeState, name): name
@@ -53,10 +53,10 @@ class Arm(BaseArm):
     arm : str, optional
         Arm file: shipped name or path. Not given: that of the controller that runs.
     join : bool, optional
-        True: work with nodes that run. False: start a separate simulator, observer, controller and action server. Not
-        given: join if something runs, otherwise start.
+        True: join nodes that already run. False: start a separate simulator, observer, controller and action server.
+        Not given: join if something runs, otherwise start.
     namespace : str
-        Of the nodes that run.
+        Namespace of the nodes that run.
     file : str or Path, optional
         Parameter file of nodes to start; not given: the arm's shipped one, for another arm a design.
     parameters : mapping, optional
@@ -207,7 +207,7 @@ class Arm(BaseArm):
         return Arrival(1e-9 * (stamp_ns(self._state.header.stamp) - start), result.tip_swing)
 
     def wait(self, seconds):
-        """Wait for `seconds` of the wall clock, and take what comes [s]."""
+        """Wait for `seconds` of wall time [s], and receive messages meanwhile."""
         self.session.serve(seconds)
 
     def stop(self):

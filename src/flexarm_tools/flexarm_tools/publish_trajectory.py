@@ -15,9 +15,9 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_studies.commands.options import numbers
 
-#: Number of points of the message: few suffice, as quintics between them follow these families exactly, or nearly so.
+#: Number of points of the message. Few suffice: quintics between them follow these families exactly or nearly so.
 POINTS = {"paper": 101, "quintic": 101}
-#: Settings of the families as options: lists of numbers, and options that are taken as they are written.
+#: Options that are settings of the families: lists of numbers, and options that are passed on as written.
 _LISTS = ("from", "to", "tip", "via", "torque-limit", "velocity-limit")
 _PLAIN = ("duration", "smoothness", "shaper", "shape-modes")
 
@@ -86,7 +86,7 @@ def add_arguments(parser):
 
 
 def settings_of(options):
-    """What the options set, as `specs.motion` takes it."""
+    """The settings in the options, in the form that `specs.motion` takes."""
     given = {key: getattr(options, key.replace("-", "_"), None) for key in (*_LISTS, *_PLAIN)}
     given["from"] = options.start
     out = {key: str(given[key]) for key in _PLAIN if given[key] is not None}

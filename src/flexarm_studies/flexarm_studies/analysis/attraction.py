@@ -18,7 +18,7 @@ from ..loop import scenario as scenarios
 MAX_TURN, MAX_BEND = 3.0, 0.3
 #: An arm has come back within this fraction of its largest excursion [-], or within this of its rest [rad], [m].
 BACK, FLOOR = 0.1, 1e-4
-#: This is judged over the last part of the run [s].
+#: Length of the last part of the run, over which this is judged [s].
 LATE = 0.25
 #: Length of the run, in time constants of the slowest pole [-], and its limits [s].
 DECAYS, MIN_TIME, MAX_TIME = 8.0, 1.0, 8.0

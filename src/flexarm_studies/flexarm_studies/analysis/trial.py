@@ -20,7 +20,10 @@ REST = 1e-7
 
 
 def long_enough(pole):
-    """Time for which to watch a loop with this critical pole [s]: each third of it contains a whole oscillation."""
+    """Time for which to watch a loop with this critical pole [s].
+
+    Each third of it contains a whole oscillation, unless the time would exceed `MAX_WATCHED`.
+    """
     period = 2.0 * np.pi / abs(pole.imag) if pole.imag else 0.0
     return float(min(max(WATCHED, 3.0 * period), MAX_WATCHED))
 

@@ -21,9 +21,9 @@ ARMS = {
 }
 #: The observer for which a design is made.
 DESIGNED = TYPES["observer.type"]
-#: Arm to its control under `DESIGNED` and under other observers: shipped file (empty: the nodes' defaults), rate [Hz].
-#: Without options, the nodes' control for R is that of the paper. For other arms it is a design, whose gains are made
-#: for its own observer. The gains of the other file are for observers that have a model.
+#: Arm to its control under `DESIGNED`, and under other observers: shipped file (empty: the nodes' defaults), rate [Hz].
+#: The nodes' default control for R is that of the paper. For other arms it is a design, whose gains are made for its
+#: own observer. The gains of the other file are for observers that have a model.
 CONTROLS = {
     "R": (("", 1000.0), ("", 1000.0)),
     "two_link": (("two_link_designed", 500.0), ("two_link", 1000.0)),

@@ -139,7 +139,7 @@ def jobs(cases, wanted):
             own = _case_of(lie, case)
             if lie.suits(own, arm_of(own.arm, own.noise)):
                 found.setdefault(own, []).extend((own, lie, moment) for moment in lie.moments)
-    # The same lie may be one run of several cases: modal rates have an observer of their own.
+    # Several cases may have the same run of a lie: with modal rates, the observer is always `true_rates`.
     return [job for own in found.values() for job in dict.fromkeys(own)]
 
 

@@ -16,11 +16,11 @@ from ..loop import scenario as scenarios
 
 #: Like the drivers' `torque_timeout` and the controller's `state_timeout` [s].
 TORQUE_TIMEOUT, STATE_TIMEOUT = 0.05, 0.5
-#: After a race for one sample's answer, silence for this long [s].
+#: After a race (see `Gate`), no torque is accepted and the safe action acts for this long [s].
 ALONE = 1.0
 #: Rounding of times must not end a torque a sample early [s].
 ROUNDING = 1e-9
-#: Fields of a fault's sample to those of an `ArmSample`.
+#: Name of an array in a fault's sample to its name in an `ArmSample`.
 _ARRAYS = {
     "joint_position": "position",
     "joint_velocity": "velocity",
@@ -34,9 +34,9 @@ _ARRAYS = {
 class Gate:
     """Decides which torque acts, by the rules of `flexarm_ros.torque_gate.TorqueGate`, which needs messages of ROS.
 
-    A sample names the controller whose answer to the sample before was taken. Only that controller's answer to it acts,
-    and no longer than `TORQUE_TIMEOUT` after the sample was first sent. Two torques that answer one sample under one
-    name are a race: then the safe action acts for `ALONE`.
+    Each sample names the controller whose answer to the previous sample was taken. Only this controller's answer to the
+    sample acts, and no longer than `TORQUE_TIMEOUT` after the sample was first sent. A second answer to the same sample
+    under the same name, with another torque, is a race: then the safe action acts for `ALONE`.
 
     Parameters
     ----------

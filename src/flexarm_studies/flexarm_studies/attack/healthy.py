@@ -41,7 +41,7 @@ OFTEN = {"R": 6, "two_link": 2}
 
 
 def plant(case, random):
-    """The simulated arm, that of the case with additional friction; and a factor of its payload."""
+    """The simulated arm: the case's, with additional random friction; and a random factor of its payload."""
     arm = arm_of(case.arm, case.noise)
     joints = []
     for joint in arm.joints:
@@ -53,7 +53,7 @@ def plant(case, random):
 
 
 def bears(case):
-    """Whether a case's control withstands all of that; otherwise its real errors would count as false alarms.
+    """Whether a case's control withstands the usual disturbances; if not, its real errors would count as false alarms.
 
     Under gravity only a control designed for unknown payloads does. On two_link a joint swings by itself under
     `motion_kalman` without measured velocity.
@@ -86,8 +86,8 @@ def motion(case, random):
 class UsualDriver(LyingDriver):
     """A driver that loses samples and stamps them at other times, to the usual extent.
 
-    `state drop` and `state jitter` of the fault injector do the same; numbers from one generator take a tenth of the
-    time.
+    `state drop` and `state jitter` of the fault injector do the same. Here one generator makes all random numbers,
+    which takes a tenth of the time.
     """
 
     def __init__(self, *args, **others):

@@ -54,8 +54,8 @@ class Lie:
     amplitude, rates : bool
         It needs a driver that sends modal amplitudes, modal rates.
     visible : float
-        Error of the false reading from which the lie can be seen at all, in the reading's unit; 0: from its first
-        sample.
+        Smallest error of the false reading at which the lie can be seen, in the reading's unit; 0: it can be seen from
+        its first sample.
     """
 
     name: str

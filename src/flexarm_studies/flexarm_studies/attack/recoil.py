@@ -26,14 +26,14 @@ COLUMNS = (
 def recoil(honest, allowed=CRITERIA["returning"]):
     """Largest speed of each joint within `SOON` after it is let go, over its largest speed in the motion.
 
-    The arm is at rest, bent as in the motion at its largest strain. Then the static torque acts, and a part of the
-    torque limit against each joint's first acceleration.
+    The arm is at rest, bent as in the motion at its largest strain. Then two torques act: the static torque, and a
+    fraction of the torque limit against each joint's first acceleration.
 
     Parameters
     ----------
     honest : Honest
     allowed : float
-        That part [-].
+        This fraction [-].
 
     Returns
     -------

@@ -8,7 +8,7 @@ from .lies import LASTING
 from .run import CRITERIA
 
 MARKERS = "<!-- attack table: begin -->", "<!-- attack table: end -->"
-#: Stands in place of a time: it did not happen before the run's end.
+#: Written in place of a time if the event did not happen before the run's end.
 NEVER = "never"
 COLUMNS = (
     "lie", "speed", "strain", "excursion [rad]", "step", "outlier [%]", "returning [%]", "safe after [s]",

@@ -7,11 +7,11 @@ A run is compared with the run of the same case without a lie, `Honest`, whose m
 - *strain*: the largest strain on a gauge over the largest strain in the motion; both also *under torque*: before the
   safe action;
 - *excursion*: how far a joint leaves the range of the motion [rad];
-- *step*: the largest change of torque between two samples over that in the motion, start and end included: a motion
-  whose jerk jumps changes its torque most there, and so does a run that is stopped after it. Steps of the motion beyond
-  `KICK` of the torque limit do not enlarge the scale;
-- *outlier*: distance of the torque from that of the honest run, as a fraction of its limit; if that is too large, minus
-  the distance that other noise of the sensors alone causes;
+- *step*: the largest change of torque between two samples, over the largest one in the motion. Start and end of the
+  motion are included, because a motion whose jerk jumps changes its torque most there, and so does a run that is
+  stopped after the motion. Steps of the motion beyond `KICK` of the torque limit do not enlarge the scale;
+- *outlier*: distance of the torque from that of the honest run, as a fraction of its limit; if this is too large and
+  sensors have noise, the distance that different noise alone causes is subtracted;
 - *returning*: the largest torque in the first `SOON` after an interruption, minus the torque that holds the arm against
   gravity, as a fraction of its limit;
 - *silent*: time for which a torque acts without a new sample [s];
@@ -45,9 +45,9 @@ MIN_SCALE = 0.1
 KICK = 0.02
 #: Duration for which returning torque is judged [s].
 SOON = 0.02
-#: Beyond this the arm is lost [rad].
+#: The arm is lost if a joint angle is not below this [rad].
 LOST = 20.0
-#: A joint that is this many times as fast as the motion requires swings: the loop fails even without a lie [-].
+#: A joint swings if it is this many times as fast as the motion requires: the loop fails even without a lie [-].
 SWINGS = 3.0
 #: Largest speed of a quintic motion over its mean speed [-].
 QUINTIC = 1.875
@@ -67,7 +67,7 @@ CRITERIA = {
     "stop step": 2.0,
     "stop strain": 1.5,
 }
-#: Runs of these kinds are over also when the arm rests under a torque.
+#: Runs of these kinds also end when the arm rests under a torque.
 RESTING = (lies.SINGLE, lies.INTERRUPTION, lies.STOP)
 _MOTION = ("speed", "strain", "excursion", "silent")
 OF_KIND = {
@@ -142,7 +142,7 @@ def drive(
     begin, rest : float
         After `begin` the run is over when no torque acts and all joints have been slower than `rest` for `RESTED`.
     holds : bool
-        Whether a run is over also when the arm rests under a torque.
+        Whether a run also ends when the arm rests under a torque.
     prepare : callable, optional
         Gives the preparation of a trajectory, or None; not given: the loop's own.
 
@@ -370,7 +370,7 @@ def _safe(honest, trace, at, part):
 
 
 def _seen(honest, lie, trace, driver, at):
-    """Time when the lie could be seen: the false reading is `visible` off the true one [s]; infinite if never."""
+    """First time when the false reading differs from the true one by `visible` [s]; infinite if it never does."""
     if not lie.visible:
         return at
     name = lie.faults[0].split()[0].split(".")[0]

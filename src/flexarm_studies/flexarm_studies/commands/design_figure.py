@@ -123,7 +123,7 @@ def _poles(axes, found):
         )
     omega = np.geomspace(lowest, DRAWN * found.omega_c, 400)
     asked = wanted.decay(-omega + 0j)
-    # For real poles on it, the decay is the whole frequency.
+    # The curve of the required decay is that of real poles, whose frequency is their decay.
     axes.plot(
         omega / (2.0 * np.pi), asked, color=REFERENCE, linestyle="--", linewidth=1.0, label="asked"
     )

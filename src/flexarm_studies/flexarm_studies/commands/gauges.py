@@ -12,8 +12,8 @@ of positions on a grid, at every twentieth of the link, are ranked by the criter
 - D: det C, the volume of the ellipsoid of errors,
 - condition: condition number of R with its columns scaled to one,
 
-Up to `MAX_SETS` sets are all compared. Otherwise the best gauge is added one after the other, and single gauges are
-exchanged until that no longer helps.
+Up to `MAX_SETS` sets, all are compared. If there are more, the search starts from the best set with one gauge per mode,
+or from an even spread, and adds the best gauge one at a time. Then it exchanges single gauges until no exchange helps.
 """
 
 from itertools import combinations
@@ -104,7 +104,7 @@ def study(arm_model, observed, count=None, criterion="A"):
         raise FlexarmError(f"of {arm.name} are none: it is rigid", field="modes to observe")
     places = []
     for key in dict.fromkeys((m.link, m.direction) for m in arm.modes if m.name in observed):
-        if key[1] == REDUCED:  # its archive names the points; there are no others to choose
+        if key[1] == REDUCED:  # the points are those of its archive: there is no choice
             continue
         names = [m.name for m in arm.modes if (m.link, m.direction) == key and m.name in observed]
         present = [g for g in arm.gauges if (g.link, g.direction) == key]

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """``flexarm observers``: shows the errors of each observer's rates, by noise, sample rate and delay.
 
-The arm is simulated once per rate. A collocated PD law on the true state leads its joints through steps of the
-reference, which excite the modes. Every observer receives the same samples: joint positions and strains, with the
-given noise and counts, and the torque, but no joint velocity. Errors are rms over the run after its first tenth, in
-percent of the rms of the estimated state. With a delay, the estimate is compared with the state after the delay,
-once with prediction and once without.
+The arm is simulated once per rate. A collocated PD law on the true state makes the joints follow steps of the
+reference, which excite the modes. Every observer receives the same samples: joint positions and strains, with the given
+noise and counts, and the torque, but no joint velocity. Errors are rms over the run after its first tenth, in percent
+of the rms of the estimated state. With a delay, the estimate is compared with the state after the delay, once with
+prediction and once without.
 """
 
 from dataclasses import replace

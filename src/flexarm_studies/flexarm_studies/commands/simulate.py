@@ -105,8 +105,8 @@ def add_arguments(parser):
 def simulate(options, recorder=None, reader=read_csv):
     """Run the sub-command.
 
-    `recorder` writes the bag of ``--bag``, see `scenario.run_loop`; ``reader(path, arm, mapping)`` reads recordings, of
-    CSV files alone if not given.
+    `recorder` writes the bag of ``--bag``, see `scenario.run_loop`. ``reader(path, arm, mapping)`` reads recordings;
+    the default reads only CSV files.
     """
     run_controller.check_arguments(options)
     if run_controller.is_closed(options):
@@ -208,7 +208,7 @@ def _times(options, motion):
     if (rows := duration * options.rate) > MAX_ROWS:
         problem, limit = f"s at --rate {options.rate:g} makes {rows:.0f} rows", f"{MAX_ROWS} rows"
         raise FlexarmError(problem, field="--duration", value=duration, limit=limit)
-    # Only whole rows; the end is one if the rate divides the duration.
+    # Rows are one period apart: the end has a row only if the duration is a whole number of periods.
     count = int(duration * options.rate + 1e-9) + 1
     return np.minimum(start + np.arange(count) / options.rate, end)
 

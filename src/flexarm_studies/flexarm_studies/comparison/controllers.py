@@ -34,7 +34,7 @@ MIN_PROFILE = 0.4
 UNCHECKED = -1e3
 
 SHIPPED, PREVIEW, TUNED = (f"composite ({kind})" for kind in ("shipped", "preview", "tuned"))
-#: The composite controllers, all others are baselines.
+#: The composite controllers; all others are baselines.
 OWN = (SHIPPED, PREVIEW, TUNED)
 PID = "joint PID"
 

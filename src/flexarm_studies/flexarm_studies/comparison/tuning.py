@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tunes by simulation, with the same search, metric and number of simulations for every controller.
 
-A third of the budget goes to the first guess and a Latin hypercube. The rest goes to Nelder and Mead's simplex, from
-the best of these; when it has converged, again from the next best. The seed determines everything.
+A third of the budget goes to the first guess and a Latin hypercube. The rest goes to Nelder and Mead's simplex. It
+starts from the best of these places; when it has converged, it starts again from the next best. The seed determines
+everything.
 
 A controller that can be judged without simulation, by the poles of a linear loop, is screened first: only the best
 points of a large hypercube are simulated. Without this, most of a small budget would go to loops that can't be stable.

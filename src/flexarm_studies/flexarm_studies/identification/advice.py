@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Suggests what to measure next, from the covariance of a fit: what narrows most of the other intervals.
 
-Once a parameter j is known, the variance of i is :math:`P_{ii} - P_{ij}^2/P_{jj}`: its interval becomes narrower by
-:math:`\sqrt{1 - \rho_{ij}^2}` with the correlation :math:`\rho`. Parameters that the motion determines badly, and those
-that narrow many intervals, come first.
+Once a parameter j is known, the variance of i is :math:`P_{ii} - P_{ij}^2/P_{jj}`. Its interval is then narrower by the
+factor :math:`\sqrt{1 - \rho_{ij}^2}`, where :math:`\rho` is the correlation. Parameters that the motion determines
+badly, and those that narrow many intervals, come first.
 """
 
 import numpy as np
 
-#: An interval becomes narrower by at least this factor, or it is not mentioned.
+#: An interval is mentioned only if it becomes narrower by at least this factor [-].
 NARROWER = 0.7
 #: Max. number of suggestions, and of names in each.
 MAX_SUGGESTIONS, MAX_NAMES = 6, 4
-#: A correlation as large as this is mentioned.
+#: Correlations of at least this size are mentioned [-].
 STRONG = 0.9
 
 #: How to measure a kind of quantity by itself.

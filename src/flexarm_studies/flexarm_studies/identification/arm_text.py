@@ -18,7 +18,7 @@ from .quantities import KEY, damping_of
 DIGITS, TOLERANCE = 8, 1e-6
 #: Kind of a `Quantity`: the error of a joint's zero angle; it turns the joint's origin.
 OFFSET = "offset"
-#: A gauge or a section stays on one line, however long.
+#: Line width of the written YAML: so large that a gauge or a section stays on one line.
 WIDTH = 4096
 
 
@@ -29,8 +29,8 @@ class _Number(str):
 def rewritten(text, identified, heading=(), notes=None):
     """The `text` of the arm file from which the fit started, with the `identified` values, below a comment, `heading`.
 
-    `notes`, by names of quantities, are written behind their numbers if these have a line of their own. The new text is
-    refused if it does not give the identified arm when it is read.
+    `notes` maps names of quantities to comments. A comment is written behind its number if the number has a line of its
+    own. The new text is read back; it is refused if this does not give the identified arm.
     """
     try:
         made = _edited(text, identified, notes or {})
@@ -156,7 +156,7 @@ def _number(value, system, dimension):
 
 
 def _put(data, path, value):
-    """Set an entry and keep the comments around it; what is missing on its path is added after the first key."""
+    """Set an entry and keep the comments around it; keys missing on its path are added after the first key."""
     for key in path[:-1]:
         if isinstance(data, CommentedMap) and data.get(key) is None:
             _add(data, key, CommentedMap())
@@ -172,7 +172,7 @@ def _put(data, path, value):
 
 
 def _note(data, path, words):
-    """Write a comment behind an entry, in place of an existing one; not in a mapping on one line."""
+    """Write a comment behind an entry and replace an existing one; does nothing in a mapping on one line."""
     for key in path[:-1]:
         if isinstance(data, CommentedMap) and data.fa.flow_style():
             return

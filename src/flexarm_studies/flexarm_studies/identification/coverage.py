@@ -28,13 +28,13 @@ from .recording import Recording
 SPREAD = 0.3
 #: Rms noise of the gauges [strain], and counts of the encoder.
 NOISE, COUNTS = 0.5e-6, 4096
-#: The excitation: a sweep over both modes, then a time without torque.
+#: The excitation: a sweep over both modes, then some seconds without torque.
 SETTINGS = {"kind": "sweep", "amplitude": 6.0, "duration": 4.0, "rest": 2.0}
 SETTINGS |= {"frequency_low": 0.3, "frequency_high": 20.0}
 
 
 def nominal(counts=COUNTS, noise=NOISE):
-    """The arm whose file the fit gets: one_link with friction, an encoder, and gauges with noise."""
+    """The arm whose file is the start of the fit: one_link with friction, an encoder, and gauges with noise."""
     arm = arm_file.load("one_link")
     joint = replace(arm.joints[0], friction=Friction(0.2, 0.1, 0.01), encoder_counts=counts)
     payload = replace(

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Compares motor currents with the torque of the motion, for torque constant and friction of each joint.
 
-With the torque :math:`\tau` of the model when its joints move as recorded,
+Let :math:`\tau` be the torque of the model when its joints move as recorded. Then
 
 .. math::
     K\,I = \tau + J\ddot q + f_v\dot q + f_c\tanh(\dot q/v_0) + b,
 
-This is linear in 1/K, J/K, f_v/K, f_c/K and b/K: a regression on the fitted part finds them. K is the torque per ampere
-at the joint, in the scale of the arm file's masses. J is what must be added to the rotor's inertia in the file. The
+This is linear in 1/K, J/K, f_v/K, f_c/K and b/K; a regression on the fitted part finds them. K is the torque per ampere
+at the joint. It scales with the masses of the arm file. J must be added to the rotor's inertia in the file. The
 unexplained fraction of the current is the normalised residual sum of squares :math:`\sum(I - \hat I)^2/\sum(I - \bar
-I)^2`; 0: nothing.
+I)^2`; it is 0 if the model explains everything.
 """
 
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ class MotorFit:
     ----------
     joint : str
     constant, viscous, coulomb, inertia : tuple of float
-        Value and half of its 95 % interval: torque per ampere [N m/A], friction [N m s/rad], [N m], inertia beside the
-        file's [kg m^2].
+        Value and half of its 95 % interval: torque per ampere [N m/A], viscous and Coulomb friction [N m s/rad], [N m],
+        inertia in addition to the file's [kg m^2].
     left, left_of_scored : float
-        Normalised residual sum of squares of the fitted and of the scored part [-].
+        Normalised residual sum of squares in the fitted and in the scored part [-].
     """
 
     joint: str
@@ -48,12 +48,12 @@ class MotorFit:
 
     @property
     def explained(self):
-        """Whether the model explains the current, so that friction and constant mean something."""
+        """Whether the model explains the current; only then are friction and torque constant meaningful."""
         return self.constant[0] > 0.0 and self.left < EXPLAINED
 
 
 def torques(arm, run, corner, offset=None):
-    """Torque of each motor without friction under the recorded motion, shape (s, n) [N m], and the predictor.
+    """Torque of each motor in the recorded motion, without friction, shape (s, n) [N m], and the predictor.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def motor_fits(found, run, fitted, scored, corner, other=None):
     found : StrainFit
     run : Recording
     fitted, scored : slice
-        Samples; those that are scored are of `other`, if given.
+        Samples of `run`; if `other` is given, `scored` are samples of `other`.
     corner : float
         Of the low pass of the joint angles [Hz].
     other : Recording, optional
@@ -130,13 +130,13 @@ def _left(current, predicted):
 
 
 def _regressed(X, y):
-    """As `regression`, with as many lags as the correlation of the residuals between successive samples requires."""
+    """As `regression`; the number of lags follows from the correlation of successive residuals."""
     left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
     return regression(X, y, min(bandwidth(left[:, None]), len(y) // 4))
 
 
 def _made(name, value, width, left):
-    """A `MotorFit` from the regression's coefficients: inertia and friction are ratios to the first one."""
+    """A `MotorFit` from the regression's coefficients: inertia and friction are coefficients over the first one."""
     a, wide = value[0], width[0] / max(abs(value[0]), 1e-300)
     ratio = lambda k: (float(value[k] / a), float(np.hypot(width[k] / a, value[k] / a * wide)))  # noqa: E731
     return MotorFit(

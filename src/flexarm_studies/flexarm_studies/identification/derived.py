@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Computes values that follow from an arm file: frequencies, damping and coupling of its modes.
 
-They are for the straight arm at rest in one configuration, with joints locked and free. The coupling of joint j with
-the locked mode i is :math:`\gamma_{ji} = (M_{12}\Psi)_{ji}` with the mode's shape :math:`\Psi_i` of unit modal mass:
-its square is the part of the inertia about joint j that mode i contributes. Free modes are those of (2) with structural
+They are for the undeformed arm at rest in one configuration, with joints locked and free. The coupling of joint j with
+the locked mode i is :math:`\gamma_{ji} = (M_{12}\Psi)_{ji}`, where the mode's shape :math:`\Psi_i` has unit modal mass.
+Its square is the part of the inertia about joint j that mode i contributes. Free modes are those of (2) with structural
 damping and the joints' viscous friction. Intervals come from the parameters' covariance by the delta method.
 """
 
@@ -41,7 +41,7 @@ class Derived:
 def derived(arm, position, identified=None):
     """Frequencies, damping ratios and coupling of an arm at a joint `position` (n,) [rad], as a list of `Derived`.
 
-    What was `identified` gives their intervals.
+    The result of a fit, `identified`, gives their intervals.
     """
     names, values = values_of(arm, position)
     widths = np.full(values.size, np.nan)

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Fits an arm's parameters (output-error method), with intervals that are valid for coloured residuals.
 
-Parameters :math:`\theta`, gauge biases and initial state x_0 are those whose prediction (`predictor`) is closest to the
-measurement,
+The fit finds the parameters :math:`\theta`, gauge biases and initial state x_0 whose prediction (`predictor`) is
+closest to the measurement,
 
 .. math:: \min_{\theta, x_0} \sum_k\sum_c w_{kc}\,(y_{kc} - \hat y_{kc})^2/\sigma_c^2 ,
 
 where :math:`\sigma_c` of each channel follows from its residuals. An encoder that stays on one count for r samples has
-made one measurement, not r: its samples have the weight :math:`w = 1/r`. (Ljung, System Identification, 1999, 7.2 and
-9.)
+made one measurement, not r, so each of these samples has the weight :math:`w = 1/r`. (Ljung, System Identification,
+1999, 7.2 and 9.)
 
-A vibration whose frequency has a relative error s is in opposite phase after 1/(2 s) periods, and from then on the sum
-has other minima. So the fit begins with the first periods of the motion and continues with longer and longer parts of
-it.
+If the frequency of a vibration has a relative error s, prediction and measurement are in opposite phase after 1/(2 s)
+periods. Over longer times the sum has other minima. So the fit begins with the first periods of the motion and
+continues with longer and longer parts of it.
 
-The covariance, for scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, is
+With the scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, the covariance is
 
 .. math:: P = A^{-1} S A^{-1}, \quad A = J^T J, \quad
           S = \sum_{|l|\le L}\left(1 - \tfrac{|l|}{L + 1}\right)\sum_k s_k s_{k+l}^T
@@ -22,8 +22,8 @@ The covariance, for scores :math:`s_k = \sum_c J_{kc}^T r_{kc}`, is
 (Newey and West 1987; L by Andrews 1991 from the most coloured channel). For white residuals this is the usual
 :math:`\sigma^2 (J^TJ)^{-1}`; the larger of the two variances is used. Intervals are :math:`\pm 1.96\sqrt{P_{ii}}`.
 
-A parameter that the motion does not determine keeps the file's value. Such a parameter has an interval wider than a
-fraction of its value. The worst one is taken first; then the others are fitted again.
+A parameter that the motion does not determine keeps the file's value. A parameter counts as such if its interval is
+wider than a fraction of its value. The worst one is held first; then the others are fitted again.
 """
 
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ from .quantities import changed, held, quantities
 NORMAL = 1.959964
 #: Difference step of the Jacobian, as a fraction of a quantity's scale [-].
 STEP = 1e-7
-#: First part of the motion that is fitted, in periods of the slowest mode, and factor from each part to the next.
+#: Length of the first part that is fitted, in periods of the slowest mode, and growth factor from part to part [-].
 FIRST_PERIODS, GROWTH = 1.0, 2.0
 #: Standard deviation of the prior around the file's value in these parts, as a fraction of the scale [-].
 PRIOR = 0.5
@@ -73,7 +73,7 @@ class Identified:
     Attributes
     ----------
     arm : Arm
-        With the fitted values, or the file's value if a quantity is held or undetermined.
+        The arm with the fitted values; quantities that are held or undetermined have the file's value.
     quantities : list of Quantity
         Of the arm, fitted or not.
     values, half_widths : ndarray, shape (p,)
@@ -83,12 +83,12 @@ class Identified:
     initial : ndarray, shape (2 (n + m),)
         Initial state.
     predicted : ndarray, shape (s, n + g)
-        Joint angles and strains of the fit.
+        Joint angles and strains that the fitted model predicts.
     measured : ndarray, shape (s, n + g)
     noise : ndarray, shape (n + g,)
         Rms residual of each channel [rad], [strain].
     held, undetermined : tuple of str
-        Kept on request; kept because the motion does not determine them.
+        Quantities that keep the file's value on request, and because the motion does not determine them.
     warnings : tuple of str
     """
 
@@ -112,7 +112,7 @@ def identify(arm, recording, hold=(), limit=0.5):
     Parameters
     ----------
     arm : Arm
-        Start of the fit, and the values of everything that the motion does not determine.
+        Start of the fit; it also gives the values of everything that the motion does not determine.
     recording : Recording
     hold : sequence of str
         Names, or patterns with ``*``, of quantities that keep the file's value.
@@ -154,7 +154,7 @@ class Problem:
     # Scales ----------------------------------------------------------------------------------
 
     def _weights(self):
-        """Square roots of w, shape (s, n + g): a run on one count weighs as one sample, a missing value zero."""
+        """Square roots of w, shape (s, n + g): a run on one count weighs as one sample; missing values have 0."""
         weight = np.isfinite(self.measured).astype(float)
         for c in range(self.predictor.n):
             reading = self.measured[:, c]
@@ -253,7 +253,7 @@ class Problem:
             )
 
     def _kept(self):
-        """The current point, and its cost with the noise assumed before any fit, which makes fits comparable."""
+        """The current point and its cost. The cost uses the noise assumed before any fit, so fits are comparable."""
         noise, self.noise = self.noise, self._prior_noise()
         cost = float(np.sum(self.residuals(self._unknowns(), len(self.measured)) ** 2))
         self.noise = noise
@@ -268,7 +268,7 @@ class Problem:
         self.refine()
 
     def refine(self):
-        """Fit the whole, with noise estimated from the residuals."""
+        """Fit the whole motion, with noise estimated from the residuals."""
         whole = len(self.measured)
         for tolerance in (1e-4, 1e-7):
             self._solve(whole, prior=False, tolerance=tolerance, most=40)
@@ -291,7 +291,7 @@ class Problem:
         return ends
 
     def _solve(self, samples, prior, tolerance, most):
-        """Least squares from the current point; with `prior`, weakly bound to the file's values."""
+        """Least squares from the current point; `prior` adds a weak prior around the file's values."""
         start, p = self._unknowns(), int(self.free.sum())
         scales = self._scales[:p]
         file = self.file[self.free] / scales
@@ -429,7 +429,7 @@ def robust_covariance(J, r, used):
     r : ndarray, shape (s, c)
         Weighted residuals.
     used : int
-        Measurements.
+        Number of measurements.
     """
     whole, unknowns = len(r), J.shape[-1]
     size = np.sqrt(np.sum(J**2, axis=(0, 1)))

@@ -31,7 +31,7 @@ class FitState:
     Raises
     ------
     FlexarmError
-        For a file of another fit, and for any other file.
+        If the file belongs to another fit, or is not a file of a fit.
     """
 
     def __init__(self, path, key):

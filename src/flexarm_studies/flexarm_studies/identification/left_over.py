@@ -4,8 +4,8 @@
 ``python -m flexarm_studies.identification.left_over exp1.csv tudor --mapping tudor --gauge eps31 --fit 14:60 --score
 60:80 --band 8:21`` fits what belongs to the recording, while the arm's parameters are held. It regresses the residual
 of a gauge, in a band of frequencies, on sets of signals at many lags (`ridge`). This linear model is as large as the
-fitted part allows. If even this explains nothing, no model of that input does that is linear, or linear for each side
-of the gears' play.
+fitted part allows. If even this explains nothing, then no linear model of that input can explain the residual, nor can
+a model that is linear for each side of the gears' play.
 """
 
 import argparse
@@ -26,14 +26,14 @@ from .prescribed import MotionPredictor
 from .strain_fit import Options
 from .strain_study import Study, study
 
-#: The arm's numbers, as patterns of `Options.hold`.
+#: The arm's parameters, as patterns of `Options.hold`.
 HOLD = ("joints*", "links*", "payload*", "gauges*gain", "gauges*position", "* offset")
-#: Past and future that the regressions use [s], and the same for the other gauges.
+#: Length of past and future that the regressions use [s]; for the other gauges, both have the third length [s].
 PAST, FUTURE, NEAR = 0.6, 0.2, 0.1
 
 
 def signals(run, predicted, motion, gauge):
-    """Sets of signals: name to columns (s, c), seconds of the future and seconds of the past.
+    """Sets of signals: a dict of name to columns (s, c), seconds of the future and seconds of the past.
 
     Parameters
     ----------

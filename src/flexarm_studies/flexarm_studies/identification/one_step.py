@@ -3,8 +3,8 @@
 
 ``python -m flexarm_studies.identification.one_step exp1.csv rough.yaml --mapping tudor --observer observer.yaml --fit
 14:60 --score 60:80`` prints the rms errors of a part of a recording. An autoregression and the observer's memory of its
-innovations are fitted on another part, and kept from then on. Persistence takes the last reading as the prediction of
-the next one. The autoregressions are of all gauges on all gauges.
+innovations are fitted on another part and then kept constant. Persistence takes the last reading as the prediction of
+the next one. The autoregressions predict each gauge from all gauges.
 """
 
 import argparse
@@ -32,20 +32,20 @@ MICRO = 1e6
 
 
 def filter_errors(arm, parameters, run, learnt):
-    """Measured minus predicted strain of each sample, by the filter alone and with its memory, shape (s, g) each.
+    """Measured minus predicted strain of each sample, for the filter alone and with its memory, shape (s, g) each.
 
     Parameters
     ----------
     arm : Arm
-        With the recording's joints and gauges.
+        It has the recording's joints and gauges.
     parameters : dict
         Of the observer, without its type.
     run : Recording
         It begins at rest.
     learnt : int
-        Samples after which the memory's coefficients are kept.
+        Number of samples after which the memory's coefficients stay constant.
     """
-    built = model.build(arm.known)  # as the observer node: its links fixed to the motors
+    built = model.build(arm.known)  # as in the observer node: the links are fixed to the motors
     core = observe(built, OBSERVER, parameters)
     sample = ArmSample(built.n_joints, built.n_modes, len(arm.gauges))
     sample.velocity_known, sample.amplitude = False, None
@@ -63,7 +63,7 @@ def filter_errors(arm, parameters, run, learnt):
 def regression_errors(strain, fitted, order):
     """Measured minus predicted `strain`, shape (s, g), by an autoregression.
 
-    The autoregression has the `order` given and is fitted to the first `fitted` samples.
+    The autoregression has the given `order` and is fitted to the first `fitted` samples.
     """
     count = len(strain) - order
     past = [strain[order - 1 - k : order - 1 - k + count] for k in range(order)]
@@ -74,7 +74,7 @@ def regression_errors(strain, fitted, order):
 
 
 def compare(arm, parameters, run, fitted, order=ORDER):
-    """Errors of each way to predict after the first `fitted` samples: name to rms, shape (g,) [-].
+    """Errors of each predictor after the first `fitted` samples: a dict of name to rms, shape (g,) [-].
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def compare(arm, parameters, run, fitted, order=ORDER):
     parameters : dict
         Of the observer, without its type.
     run : Recording
-        From the beginning of the fitted part to the end of the scored part, which follows it.
+        The fitted part and, directly after it, the scored part.
     fitted : int
         Samples of the fitted part.
     order : int
@@ -103,7 +103,7 @@ def compare(arm, parameters, run, fitted, order=ORDER):
 
 
 def observer_parameters(name):
-    """Parameters of the observer from a controller file by its path or shipped name, without the type."""
+    """Parameters of the observer, without the type, from a controller file; `name` is a path or a shipped name."""
     values = parameter_files.load(name)["controller"]
     found = {k.removeprefix(PREFIX): v for k, v in values.items() if k.startswith(PREFIX)}
     if found.pop("type", OBSERVER) != OBSERVER:

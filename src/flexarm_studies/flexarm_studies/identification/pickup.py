@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Finds what the bridges of gauges pick up from the motors: noise that all gauges share and that the currents show.
 
-In addition to the strain of its link, every gauge c reads the motor currents I through the same filter,
+In addition to the strain of its link, every gauge c picks up the motor currents I through the same filter,
 
 .. math::
     e_c(k) = \sum_j \sum_{l=0}^{L} h_{jl}\,I_j(k - l) + r_c(k),
 
-where e is measured minus predicted strain. Both sides are high-passed without phase: below that frequency the currents
-follow the motion, and a regression on them would hide what the model lacks. Because h is one filter for all gauges, it
-is noise: a vibration reads differently on each gauge. The sum of :math:`(r_c/\sigma_c)^2` is smallest if h is fitted to
-the mean of the gauges with the weights :math:`1/\sigma_c^2`, by ridge regression (`ridge`). The filter is used only if
-it explains blocks of the fitted part to which it was not fitted.
+where e is measured minus predicted strain. Both sides pass a high pass without phase. Below its corner the currents
+follow the motion, and a regression on them would hide what the model lacks. The filter h is the same for all gauges, so
+it describes noise: a vibration gives a different reading on each gauge. The sum of :math:`(r_c/\sigma_c)^2` is smallest
+if h is fitted to the mean of the gauges with the weights :math:`1/\sigma_c^2`. This is done by ridge regression
+(`ridge`). The filter is used only if it explains blocks of the fitted part to which it was not fitted.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from .scores import filled, high_passed
 
 #: Length of the past that is used [s].
 PAST = 0.2
-#: The filter is used if it leaves less than this of the sum of squares of blocks to which it was not fitted [-].
+#: The filter is used if it leaves less than this fraction of the sum of squares in blocks to which it was not fitted.
 USEFUL = 0.99
 #: Smallest mean square.
 LEAST = 1e-300
@@ -37,7 +37,7 @@ class Pickup:
     Attributes
     ----------
     taps : ndarray, shape (L + 1, c)
-        Strain per ampere of the current of each joint, by the number of samples ago [1/A].
+        Strain per ampere of each joint's current; row l is for the current l samples ago [1/A].
     joints : tuple of int
         Joints whose current was recorded.
     above : float
@@ -78,7 +78,7 @@ def fit(run, error, fitted, above):
     Raises
     ------
     FlexarmError
-        For a recording without currents, and a frequency out of range.
+        For a recording without currents, and for a frequency out of range.
     """
     if not 0.0 < above < 0.5 / run.period:
         limit = f"above 0, below {0.5 / run.period:g} Hz, half of the rate"

@@ -32,7 +32,7 @@ STABLE = 3.0
 class Predictor:
     """Predicts the measurements of a `recording` for arms with the same structure.
 
-    `arm` is that of the file; it determines the number of integration steps.
+    `arm` is the arm of the file; it determines the number of integration steps.
     """
 
     def __init__(self, arm, recording):
@@ -48,7 +48,7 @@ class Predictor:
     def states(self, arm, initial, samples=None):
         """States at the first `samples`, or at all, shape (s, 2 (n + m)), from the `initial` one; and the model.
 
-        NaN where the model diverges; None in place of a model if the arm can have none.
+        States are NaN where the model diverges. The model is None if none can be built for the arm.
         """
         try:
             built = model.build(arm)
@@ -104,22 +104,22 @@ class Predictor:
 def _friction_rate(built, recording):
     """Largest rate at which friction alone may stop a joint [1/s], for twice the file's friction.
 
-    At low speed Coulomb friction acts as viscous friction, coulomb / smoothing. On a joint that turns little mass this
-    is fast compared with the bending. Steps that are too long for it turn the prediction into noise.
+    At low speed Coulomb friction acts as viscous friction with the coefficient coulomb / smoothing. For a joint with
+    little inertia this is fast compared with the bending. Steps that are too long for it make the prediction useless.
     """
     n = built.n_joints
     viscous, coulomb, smoothing = built.friction_table().T
-    # If the file states none: a friction that would have an effect in this motion.
+    # At least a friction that would have an effect in this motion, in case the file has none.
     coulomb = np.maximum(coulomb, 0.02 * np.abs(recording.torque).max(axis=0))
     give = np.diag(built.terms(recording.position[0], np.zeros(n)).H)[:n]
     return 2.0 * float(np.max(give * (viscous + coulomb / smoothing)))
 
 
 def stepper(built):
-    """The compiled stepper of a `built` model that is used once.
+    """The compiled stepper of a `built` model that is used only once.
 
-    A chain's straight-line code contains its numbers. Compiling it for each set of parameters would take longer than
-    simulating the motion, so the general code is used.
+    The straight-line code of a chain contains the chain's numbers. To compile it for each set of parameters would take
+    longer than to simulate the motion, so the general code is used.
     """
     method = integrators.METHODS[METHOD]
     return built.stepper(method, False) if isinstance(built, Chain) else built.stepper(method)

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Predicts strains without torque: the joints' motors move as measured, and the links follow.
 
-With the joint motion prescribed, only the rows of the links and transmissions are left of (2),
+If the joint motion is prescribed, only the rows of (2) for links and transmissions are needed,
 
 .. math::
     M_{22}(q, \delta)\,\ddot\delta + M_{21}(q, \delta)\,\ddot q + f_2 + K_2\delta + C_2\dot\delta = 0, \qquad
     \hat\varepsilon_c(t) = g_c R_c\,\delta(t - \tau_c) + b_c + d_c\,(t - t_m),
 
 so torque, motor inertia and friction have no effect. The measured angles pass a low pass without phase and become a
-cubic spline. Its acceleration is linear between samples, as the compiled stepper needs it, and position, velocity and
-acceleration belong to one motion. The links start at rest under gravity.
+cubic spline. Its acceleration is linear between samples, as the compiled stepper needs it. Position, velocity and
+acceleration are consistent. The links start at rest under gravity.
 
-Gauge c has gain g, bias b, drift d about the middle t_m of the recording, and is late by tau (early if negative).
+Gauge c has gain g, bias b and drift d about the middle t_m of the recording; it is late by tau (early if negative).
 Between samples, :math:`\delta` is the Hermite cubic of amplitudes and rates.
 """
 
@@ -28,16 +28,17 @@ from ..recordings.motion import CORNER, low_passed
 
 #: The linearly implicit method is stable for any stiffness and damping of a transmission that the fit tries.
 METHOD = "implicit"
-#: Largest phase per step [rad] of a mode that the samples show, that is, up to `SHOWN` periods per sample [-]: the
-#: error of a strain is below a tenth of a microstrain on arms like TUDOR (tested).
+#: Largest phase per step of the fastest mode [rad]. A mode with more than `SHOWN` periods per sample [-] counts as
+#: having `SHOWN`, because the samples do not show it. The error of a strain is below a tenth of a microstrain on arms
+#: like TUDOR (tested).
 PHASE, SHOWN = 0.06, 0.2
-#: Where flanks meet, a step is at most as long as they take to meet at this speed [rad/s]: with sharp flanks the error
-#: of a strain is then some hundredths of a microstrain rms (tested).
+#: With play, a step is at most the time that the flanks take to engage at this speed [rad/s]. With sharp flanks the
+#: error of a strain is then some hundredths of a microstrain rms (tested).
 FLANK_SPEED = 1.5
-#: Flanks that meet within less than this [rad] take no shorter steps: a fit may try any play, and such a small one has
-#: little effect.
+#: Flanks that engage within a smaller angle than this [rad] do not make the steps shorter still: a fit may try any
+#: play, and such a small play has little effect.
 MIN_FLANK = 1e-4
-#: Modes of arms that the fit tries may be this much faster than the file's [-].
+#: The arms that the fit tries may have modes that are faster than the file's by this factor [-].
 MARGIN = 1.4
 
 
@@ -76,7 +77,7 @@ class MotionPredictor:
         self.adapt(arm)
 
     def adapt(self, arm):
-        """Set the `substeps` that the motion needs for this `arm`, and for others that are `MARGIN` faster."""
+        """Set the `substeps` that the motion needs for this `arm`, and for arms with modes faster by up to `MARGIN`."""
         frequencies = driven_frequencies(_chain(arm), self.position[0])
         fastest = MARGIN * float(np.max(frequencies, initial=0.0))
         rings = min(fastest, SHOWN * 2.0 * np.pi / self.period)
@@ -101,7 +102,7 @@ class MotionPredictor:
         Returns
         -------
         delta, rate : ndarray, shape (s, m)
-            NaN where the model diverges, or the arm can have none.
+            NaN where the model diverges, or if none can be built for the arm.
         built : Chain or None
         """
         count = len(self.position) if samples is None else samples
@@ -151,9 +152,9 @@ class MotionPredictor:
 
 
 def shifted(values, slopes, delay, period):
-    """A series (s,) late by `delay` [s], from values and derivatives at the samples by cubics; its ends held.
+    """A series (s,) delayed by `delay` [s], interpolated by cubics; beyond its ends it keeps the end values.
 
-    The `slopes` are per second, the `period` is between samples [s].
+    The cubics have the `values` and the derivatives `slopes` [1/s] at the samples, one per `period` [s].
     """
     at = np.clip(np.arange(len(values)) - delay / period, 0.0, len(values) - 1.0)
     k = np.minimum(at.astype(int), len(values) - 2)
@@ -166,7 +167,7 @@ def shifted(values, slopes, delay, period):
 
 
 def driven_frequencies(built, position, delta=None):
-    """Angular frequencies of links and transmissions while the motors are held, ascending [rad/s]; play closed.
+    """Angular frequencies of links and transmissions with the motors held and play closed, ascending [rad/s].
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ def driven_frequencies(built, position, delta=None):
     position : ndarray, shape (n,)
         [rad]
     delta : ndarray, shape (m,), optional
-        Deflections at which the arm's stiffness is taken; straight if not given.
+        Deflections at which the arm's stiffness is computed; if not given, the arm is straight.
     """
     from scipy.linalg import eigh
 

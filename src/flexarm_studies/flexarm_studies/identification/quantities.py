@@ -28,7 +28,7 @@ class Quantity:
     dimension : str
         As `flexarm_dynamics.arm.units` names it.
     scale : float
-        Size of its changes; an interval is compared with it if the value is near zero.
+        Typical size of its changes; an interval is compared with it if the value is near zero.
     low : float
         Smallest possible value.
     """
@@ -53,7 +53,7 @@ class Quantity:
 def quantities(arm, recording):
     """All quantities of an arm that can be identified, in the file's order.
 
-    The torques and speeds of the `recording` give friction a scale if the file has none.
+    The torques and speeds of the `recording` give a scale for friction if the file has none.
     """
     found = []
     torque = np.abs(recording.torque).max(axis=0)
@@ -154,7 +154,7 @@ def _put_stiffness(arm, value, i, direction):
     arm = _link(arm, i, stiffness={**link.stiffness, direction: value})
     if not flexibility.frequencies:
         return arm
-    # Measured frequencies determine the shapes: scaled with the stiffness, they leave the shapes unchanged.
+    # Measured frequencies determine the shapes. If they are scaled with the stiffness, the shapes do not change.
     frequencies = tuple(float(ratio * f) for f in flexibility.frequencies)
     return _flexibility(arm, i, direction, frequencies=frequencies)
 
@@ -171,7 +171,7 @@ def _put_damping(arm, value, i, direction, k):
 
 
 def _payload_scale(arm):
-    """Mean of the payload's principal inertias [kg m^2]: of one number, that number."""
+    """Mean of the payload's principal inertias [kg m^2]; if the inertia is one number, that number."""
     return float(np.trace(np.array(arm.payload.inertia))) / 3.0
 
 

@@ -20,16 +20,16 @@ JITTER = 0.2
 MIN_SAMPLES = 20
 #: `JointTorque.ENABLED`.
 ENABLED = 1
-#: Samples after the first enabled torque (and before the last) that are left out: a safe action may still act.
+#: Number of samples that are left out after the first enabled torque and before the last: a safe action may act there.
 MARGIN = 2
-#: What is measured of joints, gauges and modes: the attributes of a `Recording` that have a row per sample.
+#: Attributes of a `Recording` that have a row per sample: those of joints, and all.
 OF_JOINTS = ("position", "velocity", "acceleration", "torque", "current")
 SIGNALS = (*OF_JOINTS, "strain", "amplitude", "linear_acceleration", "angular_velocity")
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A recorded motion, without gaps. Values that were not measured are NaN, or None if none of a kind were.
+    """A recorded motion, without gaps. Values that were not measured are NaN; a kind never measured is None.
 
     Attributes
     ----------
@@ -50,13 +50,13 @@ class Recording:
     linear_acceleration, angular_velocity : ndarray, shape (s, i), or None
         Of the axes of IMUs [m/s^2], [rad/s].
     joint_names, gauge_names, mode_names, imu_names : tuple of str
-        Names of the columns; empty if only the arm has them.
+        Names of the columns; empty if only the arm gives them.
     start : float
         Time of the first sample, as the source counts it [s].
     stamps : ndarray, shape (k,), or None
-        Times of all samples of the source, also of those that were left out, as it counts them [s].
+        Times of all samples of the source, as it counts them, including samples that were left out [s].
     held : tuple of str
-        Joints that were not measured, because they stand still.
+        Joints that were not measured because they stand still.
     """
 
     period: float
@@ -124,7 +124,7 @@ class Recording:
 
 
 def kind_of(quantity):
-    """What a quantity of `SIGNALS` belongs to: joint, gauge, mode or imu."""
+    """Which of joint, gauge, mode and imu a quantity of `SIGNALS` belongs to."""
     return mappings.QUANTITIES[quantity][0]
 
 
@@ -136,9 +136,9 @@ def uniform(time, signals, usable=None, **more):
     time : ndarray, shape (k,)
         Ascending [s].
     signals : dict
-        Of `SIGNALS`, ``position`` and ``strain`` among them, to arrays with k rows.
+        Names of `SIGNALS`, including ``position`` and ``strain``, to arrays with k rows.
     usable : ndarray of bool, shape (k,), optional
-        Samples whose torque is what moved the arm; None: all.
+        Samples whose recorded torque is the one that moved the arm; None: all.
     more
         Further attributes of the `Recording`.
 
@@ -161,7 +161,7 @@ def uniform(time, signals, usable=None, **more):
         limit = f"at least {MIN_SAMPLES}, with ascending stamps"
         raise FlexarmError("samples are no motion", value=time.size, limit=limit)
     period = float(np.median(steps))
-    # Sample k is joined to k - 1 when the torque in between is known and lasted one period.
+    # Sample k follows k - 1 without a gap if the torque in between is known and lasted one period.
     joined = (np.abs(steps - period) <= JITTER * period) & usable[1:]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], joined.astype(int), [0]])))
     if not edges.size:
@@ -202,9 +202,9 @@ def read_csv(path, arm=None, mapping=None):
     ----------
     path : str or Path
     arm : Arm, optional
-        Gives the wanted joints, gauges and modes, in its order; if not given, all in the file, in the file's order.
+        It gives the joints, gauges and modes to read, and their order. If not given, all are read in the file's order.
     mapping : Mapping, optional
-        Meaning of the columns; if not given, the names in the first line are used, see `recordings.mapping`.
+        Meaning of the columns, see `recordings.mapping`; if not given, the names in the first line are used.
 
     Returns
     -------
@@ -250,7 +250,7 @@ def read_csv(path, arm=None, mapping=None):
 
 
 def _has_header(first, mapping):
-    """Whether the first row has names: by the mapping, otherwise if a cell is not a number."""
+    """Whether the first row has names: always without a mapping; else as it states, or if a cell is not a number."""
     if mapping is None:
         return True
     if mapping.header is not None:
@@ -267,7 +267,7 @@ def _is_number(word):
 
 
 def _named_columns(path, header, arm):
-    """The mapping from the names in the first line; it is refused if something wanted is missing."""
+    """The mapping from the names in the first line; refused if something that the arm needs is missing."""
     made = mappings.by_names(header, arm)
     joints = arm.joint_names if arm is not None else made.names("joint")
     wanted = ["t", *(f"{joint}_position" for joint in joints)]
@@ -282,7 +282,7 @@ def _named_columns(path, header, arm):
 
 
 def _names(mapping, arm):
-    """Names of what was measured, in the arm's order, or the file's without an arm; unknown ones are refused."""
+    """Names of what was measured, in the arm's order or, without an arm, the file's; unknown names are refused."""
     names = {kind: mapping.names(kind) for kind in mappings.KINDS}
     if arm is None:
         return names
@@ -341,10 +341,10 @@ def _check_ascending(path, lines, time):
 def from_tables(states, torques, arm):
     """A recording from the tables of `arm_state` and, if there is one, of the `joint_torque` that answered it.
 
-    With torques, only samples are used over which an enabled torque acted: the safe action before and after moves the
-    arm in ways that no recorded torque shows. The tables `states` and `torques` are those of a bag's `Contents`: arrays
-    ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once. Of the `arm` only its
-    ``joint_names``, ``gauge_names`` and ``mode_names`` are used.
+    If there are torques, only samples are used whose interval had an enabled torque. Before and after, the safe action
+    moves the arm, and no recorded torque shows this. The tables `states` and `torques` are those of a bag's `Contents`:
+    arrays ``session``, ``sequence``, ``stamp`` [ns], and ``columns``. Repeated samples are kept once. Only
+    ``joint_names``, ``gauge_names`` and ``mode_names`` of the `arm` are used.
     """
     if states is None or not states.stamp.size:
         raise FlexarmError("is not in the recording", field="arm_state")
@@ -382,7 +382,7 @@ def from_tables(states, torques, arm):
 
 
 def _enabled(enabled):
-    """Samples whose interval was under enabled torque, without `MARGIN` at either end, shape (s,) bool."""
+    """Samples whose interval had an enabled torque, without `MARGIN` samples at either end, shape (s,) bool."""
     usable = enabled.copy()
     for k in range(1, MARGIN + 1):
         usable[k:] &= enabled[:-k]

@@ -49,9 +49,9 @@ def _solved(X, Y, weight, strengths):
 
 
 def lagged(columns, first, last):
-    """The `columns` (s, c) of `first` samples ago (negative: in the future), and so on to `last`, side by side.
+    """The `columns` (s, c), delayed by `first` to `last` samples (negative: from the future), side by side.
 
-    Rows that reach beyond the ends are zero there.
+    Values from beyond the ends are zero.
     """
     made = []
     for k in range(first, last + 1):

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Fits the damping parameters of a fit of strains to the decay of free vibration in ring-downs.
 
-A sum of squares of strains overestimates damping. If a model's frequency is off by a fraction s, model and arm have
-opposite phase after 1/2s periods. From then on, the faster the model's vibration decays, the smaller the sum is. The
-decay itself does not depend on the phase. With the damping ratios :math:`\zeta_r` of ring-downs, found in measured and
-in modelled strains, and the mean squares :math:`V_g` of the residuals of the gauges, this minimises
+A fit by a sum of squares of strains overestimates damping. If a model's frequency is off by a fraction s, model and arm
+have opposite phase after 1/2s periods. From then on, the faster the model's vibration decays, the smaller the sum is.
+The decay itself does not depend on the phase. The damping ratios of ring-downs are found in measured and in modelled
+strains, :math:`\zeta_r` and :math:`\hat\zeta_r`. With the mean squares :math:`V_g` of the residuals of the gauges, this
+module minimises
 
 .. math::
     \sum_r \Bigl(\frac{\ln(\zeta_r/\hat\zeta_r)}{s_\zeta}\Bigr)^2 + \sum_g \Bigl(w\,\bigl(V_g/V_{g0} - 1\bigr)\Bigr)^2,
 
-where :math:`V_{g0}` are those of the fit. So the damping may become correct at the cost of a few per cent of the
-residuals. All other parameters stay as they are.
+where :math:`V_{g0}` are the mean squares of the fit. So the damping may become correct, and the residuals grow by a few
+per cent. All other parameters keep their values.
 """
 
 import numpy as np
@@ -18,16 +19,16 @@ from scipy.optimize import least_squares
 
 from ..recordings import rest, ring_down
 
-#: Kinds of quantities that damp.
+#: Kinds of quantities that cause damping.
 DAMPING = (
     "damping",
     "transmission_damping",
     "transmission_load_damping",
     "transmission_play_damping",
 )
-#: Deviation of the logarithm of a damping ratio, s, and weight of the residuals, w.
+#: Standard deviation s of the logarithm of a damping ratio, and weight w of the residuals [-].
 SPREAD, WEIGHT = 0.3, 6.0
-#: Smallest damping ratio that counts, and smallest and largest factor of a quantity.
+#: Smallest damping ratio that is used, and smallest and largest factor of a quantity [-].
 LEAST, LOW, HIGH = 1e-4, 0.01, 4.0
 #: Relative step of differences, and number of evaluations.
 STEP, EVALUATIONS = 0.03, 7

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Scores how well predicted strains explain measured ones, compared with model-free baselines and the noise ceiling.
 
-The score is the variance accounted for (VAF) of each gauge, also above a frequency (Butterworth of order four, without
-phase),
+The score is the variance accounted for (VAF) of each gauge, for the whole strain and for its part above a frequency
+(Butterworth high pass of order four, without phase),
 
 .. math:: \mathrm{VAF} = 1 - \frac{\mathrm{Var}(\varepsilon - \hat\varepsilon)}{\mathrm{Var}(\varepsilon)} .
 
-Three baselines are linear regressions on the joint motion, fitted on the fitted part and scored on the other:
+Three baselines are linear regressions on the joint motion, fitted on the fitted part and scored on the scored part:
 **quasi-static**, on the effect of the weight on a rigid arm, :math:`1, \cos a_i, \sin a_i` of the links' absolute
 angles a; **rigid**, with its inertial terms, :math:`\ddot a_i` and, for each pair, :math:`\cos(a_j - a_i)\,\ddot a_i`,
 :math:`\cos(a_j - a_i)\,\ddot a_j`, :math:`\sin(a_j - a_i)\,\dot a_i^2`, :math:`\sin(a_j - a_i)\,\dot a_j^2`; and
-**FIR**, also on the same terms of the last samples. For two joints these have 5, 11 and 211 coefficients. The ceiling
-is the score of a perfect model, limited by the noise of the gauges at rest.
+**FIR**, also on the same terms of past samples. For two joints these have 5, 11 and 211 coefficients. The ceiling is
+the score of a perfect model, which is limited by the noise of the gauges at rest.
 """
 
 import itertools
@@ -29,7 +29,7 @@ SINGULAR = 1e-8
 
 
 def high_passed(values, period, above):
-    """The columns of `values` (s, g) without what is below `above` [Hz]; `period` is between rows [s]."""
+    """The columns of `values` (s, g), high-passed with the corner `above` [Hz]; `period` is between rows [s]."""
     passes = butter(ORDER, above, "high", fs=1.0 / period, output="sos")
     return sosfiltfilt(passes, values, axis=0)
 
@@ -92,7 +92,7 @@ def regressors(position, velocity, acceleration):
 
 
 def baselines(motion, measured, fitted):
-    """Predictions without a model, shape (s, g) each, and their numbers of coefficients: name to both.
+    """Predictions without a model, shape (s, g), and their numbers of coefficients: a dict of name to both.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def _regressed(X, measured, fitted):
 
 
 def ceiling(recording, measured, part, above):
-    """Scores of a perfect model, from the noise in a `recording`'s longest rest without ringing; None without one.
+    """Scores of a perfect model, from the noise in a `recording`'s longest rest without ringing; None if it has none.
 
     `measured` (s, g), `part` and `above` are as for `explained`.
     """

@@ -2,9 +2,9 @@
 """How often the intervals of fits to strains alone cover the truth, for simulated arms with play drawn at random.
 
 ``python -m flexarm_studies.identification.strain_coverage --arms 100`` draws arms around `NOMINAL`, moves their joint
-as a position control would, and measures. The strains have bias, drift, a delay, and noise of which most is common to
-the gauges and correlated from sample to sample. The motor's current includes friction. Each arm is identified from the
-nominal arm's file.
+as a position control would, and measures. The strains have bias, drift, a delay and noise. Most of the noise is common
+to the gauges and correlated from sample to sample. The motor's current includes friction. Each arm is identified from
+the nominal arm's file.
 """
 
 import argparse
@@ -45,14 +45,15 @@ gauges:
 """
 #: Parameters that the user knows; they are held at the true value.
 HOLD = ("joints[0].hub_inertia", "payload.mass")
-#: Largest relative deviation of each parameter from the nominal one [-]; of biases, drifts [-], delays [s] and offsets
-#: [rad].
+#: Largest relative deviation of each parameter from the nominal one [-], and largest bias [strain], drift over the
+#: recording [strain], delay [s] and offset [rad].
 SPREAD = 0.2
 BIAS, DRIFT, DELAY, OFFSET = 50e-6, 15e-6, 0.008, 0.03
-#: Noise that gauges share, its memory, and noise of each [-]; of the current [A]; torque per ampere [N m/A].
+#: Noise that the gauges share [strain], its autoregression [-], noise of each gauge [strain] and of the current [A],
+#: and torque per ampere [N m/A].
 COMMON, MEMORY, OWN, OF_CURRENT, CONSTANT = 1.0e-6, 0.5, 0.3e-6, 0.03, 12.0
 RATE, SECONDS = 100.0, 10.0
-#: Steps of the simulated arm per step of the fit: so the simulation does not have the fit's errors of integration.
+#: Steps of the simulation per step of the fit: the simulation must not have the fit's integration errors.
 FINER = 4
 #: Starts of each fit.
 STARTS = 3
@@ -124,7 +125,7 @@ def one(seed):
 
 
 def run(arms, seed=0, count=None, progress=None, path=None):
-    """Rows of this number of `arms`, each identified from its own recording, as `one` gives them.
+    """Rows of `one` for this number of `arms`, each identified from its own recording.
 
     Parameters
     ----------
@@ -170,7 +171,7 @@ def _kept(path):
 
 
 def table(rows_of_arms):
-    """How many intervals covered, with errors, half-widths and the mean square of error over deviation.
+    """How many intervals covered the truth, with errors, half-widths and the mean square of error over deviation.
 
     Parameters
     ----------

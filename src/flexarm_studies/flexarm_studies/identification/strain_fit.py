@@ -9,15 +9,15 @@ With residuals :math:`e_k = \varepsilon_k - \hat\varepsilon_k(\theta)` of `presc
 
 with a wide prior about the file's values. This is generalised least squares with an autoregression :math:`\rho` of
 each gauge and a covariance between the gauges, both from the residuals (Ljung, System Identification, 1999, 7.4). The
-residuals are slow if the model lacks friction, and the same in all gauges if these share a source of noise. Without the
-weights, the slow part would hide the vibration, and noise that a comparison of gauges removes would count as noise of
-each gauge.
+residuals change slowly if the model lacks friction. They are the same in all gauges if the gauges share a source of
+noise. Without the weights, the slow part would hide the vibration. Noise that a comparison of gauges removes would
+count as noise of each gauge.
 
-The sum has many minima. The fit begins at several points; the first one is that of the arm file. At each, gains and
-biases follow by linear regression; then delays, offsets and drifts are held for the first steps. The best point goes on
-with all quantities. Intervals are those of `fit` (Newey and West). A combination of parameters along which no strain
-changes is named, and one of these parameters keeps the file's value. A parameter whose interval is too wide is named,
-too. It keeps its fitted value, because the values of the others depend on it.
+The sum has many minima. So the fit begins at several points; the first one is that of the arm file. At each point, a
+linear regression gives gains and biases. Delays, offsets and drifts are held for the first steps. The fit continues
+from the best point with all quantities. Intervals are those of `fit` (Newey and West). A combination of parameters
+along which no strain changes is named, and one of these parameters keeps the file's value. A parameter whose interval
+is too wide is named, too. It keeps its fitted value, because the values of the others depend on it.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -43,38 +43,38 @@ from .strain_quantities import (
     with_offset,
 )
 
-#: Held unless the user frees them: strains can't tell them from others, or a ruler measures them.
+#: Held unless the user frees them: strains can't distinguish them from others, or a ruler measures them.
 HELD = ("links[*].mass_per_length", "gauges[*].position")
 #: Difference step of the Jacobian, as a fraction of a quantity's scale [-].
 STEP = 1e-7
 #: Autoregression of the residuals before they are known [-], and their size, as a fraction of the signal [-].
 FIRST_MEMORY, FIRST_NOISE = 0.9, 0.02
-#: Longest correlation time of the residuals that is assumed [s], even if the true one is longer: with an
+#: Longest correlation time of the residuals that the weights assume [s], even if the true one is longer. With an
 #: autoregression of one, the level of a gauge would have no effect. An autoregression smaller than the true one acts
 #: like any filter of the residuals: the values are still consistent, and the intervals allow for the remaining colour.
 MAX_MEMORY_TIME = 0.5
 #: Number of starts, and range of factors of stiffness and play from the second one on.
 STARTS, RANGE = 6, (0.6, 1.7)
-#: Kinds that a start varies; kinds that stay as they are for its first steps.
+#: Kinds that a start varies, and kinds that are held during its first steps.
 VARIED = ("EI", "transmission_stiffness", "transmission_play")
 LATER = ("offset", "delay", "drift", "hub_inertia")
 #: Each start is fitted to the first samples: this fraction of all, and at least this many seconds.
 START_PART, START_SECONDS = 0.35, 10.0
 #: Evaluations of a start, and of each pass with new weights; largest number of passes.
 START_STEPS, PASS_STEPS, PASSES = 12, 20, 10
-#: From the second pass on, secants replace derivatives for this number of evaluations: one derivative of all quantities
-#: costs as much as 25 evaluations. Far from the final values, secants mislead.
+#: From the second pass on, secants replace derivatives for this number of evaluations, because one derivative by all
+#: quantities costs as much as 25 evaluations. Far from the final values, secants are misleading.
 BETWEEN = 3
 #: Relative tolerance of the sum of squares in the first pass, whose weights are those of a poor fit.
 FIRST_TOLERANCE = 1e-4
-#: The weights fit the values when a pass leaves at least this fraction of the sum of squares, and the autoregression
-#: from its residuals differs by at most this from the one in the weights [-].
+#: The passes end when a pass leaves at least the first fraction of the sum of squares, and the autoregression of its
+#: residuals differs by at most the second number from the one in the weights [-].
 SETTLED, SAME_MEMORY = 0.98, 0.01
 #: Singular values of the Jacobian, with columns of unit length, below this count as zero [-].
 SINGULAR = 1e-4
-#: Deviation of the prior about the file's value, in scales [-]: what strains hardly determine stays near it.
+#: Deviation of the prior about the file's value, in scales [-]: values that strains hardly determine stay near it.
 PRIOR = 1.0
-#: A quantity takes part in a combination if it has this fraction of the singular vector [-].
+#: A quantity belongs to a combination if its component of the singular vector has at least this size [-].
 INVOLVED = 0.03
 #: Smallest noise [-].
 MIN_NOISE = 1e-9
@@ -89,7 +89,7 @@ class Options:
     Attributes
     ----------
     hold, free : tuple of str
-        Names, or patterns with ``*``, of quantities that keep the file's value, and of `HELD` ones that do not.
+        Names, or patterns with ``*``, of quantities that keep the file's value, and of those of `HELD` that are fitted.
     limit : float
         A quantity is undetermined if its half-width exceeds this fraction of its value [-].
     starts : int
@@ -128,15 +128,17 @@ class StrainFit:
     predicted, measured : ndarray, shape (s, g)
         Strains of the fit, and of the recording.
     noise, memory : ndarray, shape (g,)
-        Rms of the residuals' part that is new in each sample [-], and their autoregression [-].
+        Rms of the part of the residuals that is new in each sample [-], and the residuals' autoregression [-].
     correlation : ndarray, shape (g, g)
         Correlation of that part between the gauges.
     held, undetermined : tuple of str
-        Kept on request or by default; not determined by the strains (those with a half-width have fitted values).
+        Quantities kept on request or by default, and quantities that the strains do not determine. Of the latter, those
+        with a half-width have fitted values.
     alike : tuple of tuple of str
-        Combinations along which no strain changes: of all quantities, also held ones, unless the whole arm is held.
+        Combinations of quantities along which no strain changes. They include held quantities, unless the whole arm is
+        held.
     starts : tuple of float
-        Final sum of squares of each start; the fit went on from the smallest.
+        Final sum of squares of each start; the fit continued from the smallest.
     warnings : tuple of str
     """
 
@@ -169,11 +171,11 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
     options : Options, optional
     run : callable, optional
         ``run(function, calls)`` yields (i, ``function(*calls[i])``), as `workers.results`; if not given, the calls run
-        here, one by one.
+        in this process, one by one.
     state : FitState, optional
-        What the fit has found so far; an interrupted fit goes on from there.
+        What the fit has found so far; an interrupted fit continues from there.
     report : callable, optional
-        ``report(label)`` at each step.
+        Called as ``report(label)`` at each step.
     threads : int
         Number of threads that compute derivatives; the results do not depend on it.
 
@@ -184,8 +186,8 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
     Raises
     ------
     FlexarmError
-        For a pattern that matches nothing, an arm without gauges, joints that do not move, and if no start can follow
-        the motion.
+        For a pattern that matches nothing, for an arm without gauges, for joints that do not move, and if no start can
+        follow the motion.
     """
     options = options or Options()
     report = report or (lambda label: None)
@@ -218,14 +220,14 @@ def identify_strains(arm, recording, options=None, run=None, state=None, report=
 
 
 def fit_start(arm, recording, options, number, threads=1):
-    """Fit from one start; return the sum of squares, which is comparable between starts, and values (p,)."""
+    """Fit from start `number`; return the sum of squares, which is comparable between starts, and values (p,)."""
     part = max(
         START_PART * (len(recording.position) - options.lead), START_SECONDS / recording.period
     )
     found = strain_quantities(arm, recording)
     problem = StrainProblem(arm, recording.part(options.lead + int(part)), options, found, threads)
     problem.begin(0)
-    problem.weigh_each()  # all starts in the same way, so their sums are comparable
+    problem.weigh_each()  # in the same way for all starts, so their sums are comparable
     problem.begin(number)
     problem.solve(START_STEPS, 1e-3, LATER)
     return problem.cost, problem.values
@@ -240,7 +242,7 @@ class StrainProblem:
     recording : Recording
     options : Options
     found : list of Quantity, optional
-        Those of `strain_quantities` if not given.
+        The arm's quantities; if not given, those of `strain_quantities`.
     threads : int
         Number of threads that compute derivatives.
     """
@@ -444,7 +446,7 @@ class StrainProblem:
         return e if np.isfinite(e).all() else None
 
     def weigh_each(self):
-        """Weigh each gauge by its residual: after a poor fit, what gauges have in common is vibration, not noise."""
+        """Weigh each gauge by its own residual: after a poor fit, what gauges share is vibration, not noise."""
         e = self.left()
         if e is not None:
             new = self.new_part(e)
@@ -471,7 +473,7 @@ class StrainProblem:
         self.whiten = np.linalg.inv(np.linalg.cholesky(covariance)).T
 
     def finish(self, report, state):
-        """Fit from the values of the best start: passes with new weights, parameters of equal effect left out."""
+        """Fit from the values of the best start: passes with new weights; parameters of equal effect are left out."""
         stage = 0 if state is None or state.best is None else state.best["stage"]
         self.weigh()
         settled = stage >= PASSES
@@ -508,7 +510,7 @@ class StrainProblem:
         return keep
 
     def snapshot(self, stage):
-        """Plain data from which the fit can go on."""
+        """Plain data from which the fit can continue."""
         return {
             "stage": stage,
             "values": [float(v) for v in self.values],
@@ -516,7 +518,7 @@ class StrainProblem:
         }
 
     def take(self, snapshot):
-        """Go on from a `snapshot`."""
+        """Continue from a `snapshot`."""
         self.values = np.array(snapshot["values"], float)
         for index, why in snapshot["left_out"]:
             self.leave_out(index, why)
@@ -557,7 +559,7 @@ class StrainProblem:
         return np.flatnonzero(self.free) if whole else np.arange(len(self.found))
 
     def leave_out(self, index, why):
-        """Keep the file's value of a quantity, `why` in words."""
+        """Keep the file's value of a quantity; `why` is the reason in words."""
         self.left_out.append((index, why))
         self.free[index], self.values[index] = False, self.file[index]
         q = self.found[index]
@@ -587,7 +589,7 @@ class StrainProblem:
         )  # fmt: skip
 
     def warn_of_endless(self):
-        """Name gauges whose residuals last longer than any memory that is used."""
+        """Warn of gauges whose residuals are correlated for longer than `MAX_MEMORY_TIME`."""
         names = [
             n for n, slow in zip(self.setup.arm.gauge_names, self.endless, strict=True) if slow
         ]
@@ -611,7 +613,7 @@ class StrainProblem:
 
 
 class Secant:
-    r"""Values and derivatives of a function with expensive derivatives: after the first ones, by Broyden's secants.
+    r"""Values and derivatives of a function with expensive derivatives: Broyden's secants replace most of them.
 
     .. math:: D \leftarrow D + (y_1 - y_0 - D\,\Delta x)\,\Delta x^T / |\Delta x|^2
 
@@ -620,7 +622,7 @@ class Secant:
     function, derivatives : callable
         ``function(x)`` of shape (s, g), ``derivatives(x)`` (s, g, p), for x (p,).
     between : int
-        Number of values after which derivatives are computed anew.
+        Number of new values after which derivatives are computed anew.
     """
 
     def __init__(self, function, derivatives, between):
@@ -638,7 +640,7 @@ class Secant:
         self._at = None
 
     def value(self, x):
-        """The function at x; that of the last x is kept."""
+        """The function at x; the value at the last x is kept."""
         if self._last is None or not np.array_equal(self._last[0], x):
             self._last = x.copy(), self._function(x)
             self._count += 1
@@ -671,7 +673,7 @@ def _any(found, pattern):
 
 
 def _null(J, size, indices):
-    """Combinations of columns of J, lists of `indices`, along which it is constant; `size` (p,) is that of columns."""
+    """Combinations of columns of J, lists of `indices`, whose effect cancels; `size` (p,) is the columns' length."""
     silent = size <= 1e-9 * max(size.max(initial=0.0), 1e-300)
     if silent.any() or not size.size:
         return [[int(j)] for j in indices[silent]]
@@ -690,7 +692,7 @@ def predict(found, recording, options, middle=None):
     options : Options
         Those of the fit.
     middle : float, optional
-        Time of no drift in this recording [s]; None: the readings do not drift.
+        Time in this recording at which the drift is zero [s]; None: the readings do not drift.
     """
     setup = found.setup
     predictor = MotionPredictor(setup.arm, recording, options.corner)

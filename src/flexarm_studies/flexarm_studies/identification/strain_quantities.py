@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lists what strains under a prescribed motion can determine: numbers of the arm file and of the recording.
 
-In addition to those of `quantities`, these are the parts of transmissions, what moves with the joints, and the
-positions of gauges. For the recording alone there are the error of a joint's zero angle, and each channel's delay and
-drift. Strains show only the ratio of mass and stiffness, not both: masses per length keep the file's value.
+In addition to those of `quantities`, these are the parameters of transmissions, what moves with the joints, and the
+positions of gauges. Quantities of the recording alone are the error of each joint's zero angle, and the delay and drift
+of each channel. Strains show only the ratio of mass and stiffness, not both, so masses per length keep the file's
+value.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ import numpy as np
 
 from .quantities import KEY, Quantity, damping_of, quantity
 
-#: Parts of a transmission: dimension, unit, and smallest scale.
+#: Parameters of a transmission: dimension, unit, and smallest scale.
 TRANSMISSION = {
     "stiffness": ("torque", "N m/rad", 1.0),
     "damping": ("viscous", "N m s/rad", 0.5),
@@ -21,7 +22,7 @@ TRANSMISSION = {
     "rounding": ("none", "rad", 5e-4),
     "play_damping": ("viscous", "N m s/rad", 0.5),
 }
-#: Parts that only matter if there is play.
+#: Parameters that have an effect only if there is play.
 OF_PLAY = ("rounding", "play_damping")
 #: Scales of what belongs to the recording: angle [rad], delay [s], drift over the recording [-].
 OFFSET, DELAY, DRIFT = 0.02, 0.005, 1e-5
@@ -125,7 +126,7 @@ def strain_quantities(arm, recording):
 
 
 def with_offset(arm, offset):
-    """The arm whose joints' origins are turned by `offset` (n,) [rad]: recorded angles are then its own."""
+    """The arm with its joints' origins turned by `offset` (n,) [rad], so that recorded angles are its joint angles."""
     from flexarm_dynamics.models.model import about_axis, rotation
 
     joints = []

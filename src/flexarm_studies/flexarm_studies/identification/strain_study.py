@@ -25,9 +25,10 @@ class Study:
     Attributes
     ----------
     fit, score : tuple of float, or None
-        Beginning and end, as the recording counts the time [s]; None: fit all of it, and score only the fitted part.
+        Beginning and end, as the recording counts the time [s]. If `fit` is None, all of it is fitted. If `score` is
+        None, only the fitted part is scored, and all of another recording if there is one.
     above : float
-        Frequency above which scores are given in addition to the full ones [Hz].
+        Corner of the additional high-passed scores [Hz].
     pickup : float, or None
         Frequency above which gauges are assumed to pick up the motor currents, see `pickup` [Hz]; None: they do not.
     """
@@ -53,17 +54,18 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
         With the arm's joints and gauges.
     wanted : Study
     options : Options, optional
-        Its `lead` is set here.
+        Its `lead` is replaced here.
     other : Recording, optional
-        The recording that is scored, if it is another one; its biases are determined anew while it rests.
+        Another recording that is scored; its biases are determined anew from its longest rest.
     fitting
-        As for `identify_strains`.
+        Further arguments of `identify_strains`.
 
     Returns
     -------
     found : StrainFit
     result : dict
-        Plain data: ``parts`` with scores by gauge, ``ring_downs`` (of `other`, if given), ``currents``, ``pickup``.
+        Plain data: ``parts`` with scores by gauge, ``ring_downs`` (those of `other`, if given), ``currents``,
+        ``pickup``.
     run : tuple
         Recording, measured and predicted strains (s, g), from the beginning to the end of all that was predicted.
     """
@@ -103,7 +105,7 @@ def study(arm, recording, wanted, options=None, other=None, **fitting):
 
 
 def _begin(recording, start):
-    """Beginning of the prediction: at the `start` [s] or the last rest before it; `LEAD` before it without a rest."""
+    """Beginning of the prediction [s]: the last rest up to `start` [s]; if none is within `LEAD`, `LEAD` before it."""
     still = rest.still(recording)
     row = min(max(round((start - recording.start) / recording.period), 0), len(still) - 1)
     before = max(row - round(LEAD / recording.period), 0)
@@ -119,7 +121,7 @@ def _picked(run, predicted, fitted, wanted):
 
 
 def _with_pickup(made, sizes, picked, run):
-    """Add to the predictions `made` that of the model with what the gauges pick up, if that is useful."""
+    """Add to `made` the model's prediction plus what the gauges pick up, if the pickup is useful."""
     if picked is not None and picked.useful:
         made["with pickup"] = made["model"] + picked.strain(run)[:, None]
         sizes["with pickup"] = picked.taps.size

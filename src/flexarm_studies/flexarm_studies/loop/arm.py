@@ -24,10 +24,10 @@ from flexarm_dynamics.errors import FlexarmError, TrajectoryError
 
 from . import scenario
 
-#: Default duration of a motion in periods of the lowest mode, and fraction of the limits of speed and torque that it
-#: uses.
+#: Minimum of a motion's default duration, in periods of the lowest mode; maximum fraction of the limits of speed and
+#: torque that the motion then uses [-].
 PERIODS, PART = 3.0, 0.5
-#: Minimum duration [s], and factor by which the duration is increased while the torque does not suffice [-].
+#: Minimum of the default duration [s], and factor by which it is increased while the torque does not suffice [-].
 MIN_DURATION, LONGER = 0.5, 1.3
 #: Number of points of a motion.
 POINTS = 201
@@ -52,7 +52,7 @@ class Reading:
     amplitude : ndarray, shape (m,)
         Modal amplitudes, from the gauges [m, rad].
     tip : ndarray, shape (3,)
-        Position of the tip, from both [m].
+        Position of the tip, from joint positions and modal amplitudes [m].
     supervisor : str
         READY, TRACKING, HOLDING, STOPPING, FAULT or INACTIVE.
     reason : str
@@ -79,7 +79,7 @@ class Arrival:
     seconds : float
         Time until the tip had come to rest, by the arm's clock [s].
     tip_swing : float
-        Its largest remaining swing [m].
+        Largest remaining swing of the tip [m].
     """
 
     seconds: float
@@ -168,7 +168,10 @@ class BaseArm(ABC):
         return self.follow(profiles.quintic(start, to, self.comfortable(start, to)))
 
     def comfortable(self, start, to):
-        """Duration of a motion (n,) to (n,) [rad]: `PERIODS` of the lowest mode, `PART` of speed and torque [s]."""
+        """Duration of a motion from `start` to `to`, each (n,) [rad], if none is given [s].
+
+        It is at least `PERIODS` periods of the lowest mode, and needs at most `PART` of the limits of speed and torque.
+        """
         speed = PART * np.asarray(self.model.arm.velocity_limits)
         # The quintic's largest speed is 15/8 of its mean.
         time = max((1.875 * np.abs(to - start) / speed).max(), MIN_DURATION)

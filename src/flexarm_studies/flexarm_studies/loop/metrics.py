@@ -249,7 +249,7 @@ def tracking_metrics(record, model, plant_model, end, window=3.0, tolerance=1e-3
     found["rms_torque_Nm"] = _rms(record.torque, 0).tolist()
     found["saturation_share"] = float(np.mean(record.saturated))
     if len(model.arm.links) == 1 and set(model.arm.links[0].flexible) == {"y"}:
-        phi = _phi_tip(plant_model)  # a transmission's deflection, behind them, bends nothing
+        phi = _phi_tip(plant_model)  # deflections of transmissions come later; they bend no link
         deflection = record.plant_amplitude[:, : phi.size] @ phi
         found["peak_deflection_mm"] = 1e3 * float(np.abs(deflection).max())
         long_enough = record.time[-1] >= 8.0 - 1e-9

@@ -92,9 +92,10 @@ class NetworkedLoop(ClosedLoop):
         self._torque, self._until_ns = None, 0
 
     def follow(self, trajectory, duration):
-        """As `ClosedLoop.follow`, from the first torque on: until then the controller knows no arm to move.
+        """As `ClosedLoop.follow`, but it starts with the first torque: until then the controller knows no arm to move.
 
-        A trajectory with stamp 0 gets a stamp by which it will be known, so it starts with a sample of the arm.
+        A trajectory with stamp 0 gets a stamp `LEAD` ahead. The controller knows it by then, so the motion starts with
+        a sample of the arm.
         """
         simulator = self.simulator
         latest = simulator.time + self.MAX_START

@@ -278,7 +278,7 @@ def _with_motion(rng, data, material, geared):
     if strain is None or strain.max() > material.strain:
         return None
     for gauge, largest in zip(data["gauges"], strain, strict=True):
-        # Room for vibration; no coarser than needed.
+        # The full scale leaves room for vibration, but is no coarser than needed.
         gauge["full_scale"] = next(s for s in (1e-3, 2e-3, 5e-3, 1e-2, 2e-2) if s >= 4.0 * largest)
     start, end = (";".join(f"{angle:.4f}" for angle in q) for q in ends)
     motion = f"quintic:from={start},to={end},duration={profile.duration:g}"

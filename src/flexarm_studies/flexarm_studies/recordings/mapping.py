@@ -217,7 +217,7 @@ def _sign(entry):
 
 
 def _parts(title):
-    """Name and quantity of a column; both are empty if it is not a column that is known."""
+    """Name and quantity of a column, from its title; both are empty if the quantity is unknown."""
     for quantity in sorted(QUANTITIES, key=len, reverse=True):
         if title.endswith(f"_{quantity}"):
             return title[: -len(quantity) - 1], quantity

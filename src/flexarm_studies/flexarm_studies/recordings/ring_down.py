@@ -7,9 +7,9 @@ r"""Fits free vibration while the joints stand: frequency and damping of a gauge
 
 is fitted by least squares; a, b, c, d are linear and solved for at every :math:`(\omega, \sigma)`. Intervals take into
 account that residuals are correlated from sample to sample, :math:`e_k = \rho e_{k-1} + u_k`: with V their covariance
-and J the derivatives by all six numbers, the covariance of the numbers is :math:`(J^TJ)^{-1}J^TVJ(J^TJ)^{-1}`. The
-residuals of few samples seem whiter than the errors, because six numbers were fitted. :math:`\rho` is that of the
-restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), which allows for that.
+and J the derivatives by all six numbers, the covariance of the numbers is :math:`(J^TJ)^{-1}J^TVJ(J^TJ)^{-1}`. Six
+numbers are fitted, so the residuals of few samples look whiter than the errors. :math:`\rho` is therefore found by the
+restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), which corrects for this.
 """
 
 from dataclasses import dataclass
@@ -40,11 +40,11 @@ class RingDown:
     frequency, frequency_width : float
         Damped frequency, and half of its 95 % interval [Hz].
     damping, damping_width : float
-        Ratio [-].
+        Damping ratio, and half of its 95 % interval [-].
     amplitude : float
         At the beginning [-].
     explained : float
-        Fraction of the variance, without the line [-].
+        Explained fraction of the variance, without the straight line [-].
     """
 
     part: slice

@@ -28,7 +28,7 @@ class Stream:
     time : ndarray, shape (k,)
         Stamps [s].
     signals : dict
-        Of `SIGNALS`, to arrays (k, w).
+        Name of a signal, one of `SIGNALS`, to its array (k, w).
     names : dict
         ``joint``, ``imu``, ``gauge``, to the w names of the columns.
     """

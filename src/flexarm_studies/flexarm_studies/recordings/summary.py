@@ -153,7 +153,7 @@ def _drift(recording, slowest):
 
 
 def _delays(recording):
-    """Delays of speeds after the angles' rates, of accelerations after the speeds', of gauges after the first one."""
+    """Delays: speeds after the angles' rates, accelerations after the speeds' rates, gauges after the first gauge."""
     found, period = [], recording.period
     pairs = (("velocity", "position"), ("acceleration", "velocity"))
     for later, earlier in pairs:

@@ -44,7 +44,7 @@ def drift_and_delay(recording, vibration=None):
         From the recording's start to its end, and half of its 95 % interval [-]; NaN if the motion does not determine
         it.
     delay, delay_width : ndarray, shape (g,)
-        Of the strain after the motion [s].
+        Delay of the strain after the motion, and half of its 95 % interval [s].
     """
     period, g = recording.period, recording.strain.shape[1]
     out = np.full((4, g), np.nan)
@@ -115,7 +115,7 @@ def lag(later, earlier, period):
     Returns
     -------
     delay : float
-        Of `later` after `earlier`, between samples by a parabola [s].
+        Delay of `later` after `earlier`, interpolated between samples by a parabola [s].
     alike : float
         Their correlation at that delay [-].
     """

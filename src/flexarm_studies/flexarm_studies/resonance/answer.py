@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Finds a sensor's response to small motions of each joint, near a mode, which damping by that sensor needs to know.
 
-With the model of `flexarm_control.shaping.strain_damping`, :math:`\dot z = p z + \beta u` and a reading Re z, a command
-from one place to another leaves ringing of the amplitude
-
+The model is that of `flexarm_control.shaping.strain_damping`: :math:`\dot z = p z + \beta u` with the reading Re z. In
+this model, a command from one position to another leaves ringing of the amplitude
 .. math:: a(t) = \frac{\beta}{p}\int \dot u(\tau)\,e^{p(t-\tau)}\,d\tau,
 
-because the place where a joint stands does not bend the links. :math:`\beta` is the amplitude after each step of a
-measurement, minus the rest of the ringing before it, divided by this integral. Its modulus is the sensitivity. Its
-angle is the phase, with delay and drive included.
+because a constant position of a joint does not bend the links. After each step of a measurement, :math:`\beta` is the
+amplitude, minus what is left of the ringing before the step, divided by this integral for :math:`\beta = 1`. Its
+modulus is the sensitivity. Its angle is the phase, which includes delay and drive.
 """
 
 import cmath
@@ -22,11 +21,11 @@ from flexarm_dynamics.parameters import check_all
 
 from .motion import SETTLED
 
-#: Cells in which a step is integrated.
+#: Number of cells for the integral over a step.
 CELLS = 2000
 #: Sensors that can damp, and their name in the node's parameters.
 SENSORS = {"strain": "strain", "linear_acceleration": "imu"}
-#: Full scale of an IMU, in the lines to paste [m/s^2].
+#: Full scale of an IMU, in the printed parameters [m/s^2].
 FULL_SCALE = 40.0
 #: Period of the commands for which the damping is checked [s].
 PERIOD = 0.008
@@ -34,12 +33,12 @@ PERIOD = 0.008
 
 @dataclass(frozen=True)
 class Answer:
-    """A reading's answer to corrections of a joint.
+    """Response of a reading to corrections of a joint.
 
     Attributes
     ----------
     joint, channel, sensor : str
-        Names; the sensor as in the node's parameters.
+        Names; `sensor` is the name in the node's parameters.
     index : int
         Index of the channel among those of its sensor.
     frequency, damping : float
@@ -47,7 +46,7 @@ class Answer:
     beta : complex
         [1/(rad s)] times the reading's unit.
     scatter : float
-        Scatter between the steps of the measurement, over the modulus [-].
+        Scatter of beta between the steps of the measurement, over its modulus [-].
     """
 
     joint: str
@@ -83,24 +82,24 @@ class Answer:
 
 
 def answers(found, windows, families, motion, begin):
-    """Answers of every gauge and accelerometer to every joint that has moved, near the mode that rings most.
+    """Responses of the gauges and accelerometers to every joint that has moved, near the mode that rings most.
 
     Parameters
     ----------
     found : Channels
     windows : list of Window
-        As from `measured.rings`, for a measurement by steps.
+        From `measured.rings`, for a measurement by steps.
     families : list of Family
         Of these windows.
     motion : RingingMotion
     begin : float
-        Time when it was sent, as the recording counts it [s].
+        Time when the motion was sent, as the recording counts it [s].
 
     Returns
     -------
     list of Answer
-        One per joint, all of the channel that has the answer with the smallest scatter; the largest sensitivity first.
-        Empty if the mode rang after no step.
+        One per joint, the largest sensitivity first. All are of the same channel: the one that has the answer with the
+        smallest scatter. Empty if the mode did not ring after any step.
     """
     main = max(families, key=lambda family: family.part)
     rung = {i: mode for mode, i in zip(main.modes, main.windows, strict=True)}
@@ -136,7 +135,7 @@ def _window(windows, first, end):
 
 
 def _amplitude(found, window, mode):
-    """Amplitude of a mode in each channel at a window's begin, (c,) complex, by least squares of all its modes."""
+    """Amplitude of a mode in each channel at a window's begin, (c,) complex; all its modes are fitted together."""
     part = found.rows(window.begin, window.end)
     time = found.period * np.arange(part.stop - part.start)
     turning = np.exp(np.array([m.pole for m in window.fit.modes]) * time[:, None])
@@ -148,7 +147,7 @@ def _amplitude(found, window, mode):
 
 
 def _step(pole, motion, joint, first, last, at):
-    """Response at the time `at` to the motion of a joint from time `first` to `last`, for a beta of 1 [rad s]."""
+    """Response of a pole at the time `at` to a joint's motion from time `first` to `last`, for a beta of 1 [rad s]."""
     step = (last - first) / CELLS
     time = first + step * (np.arange(CELLS) + 0.5)
     speed = motion.derivative(1, time)[:, joint]

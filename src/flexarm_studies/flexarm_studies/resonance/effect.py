@@ -4,8 +4,8 @@ r"""Computes what a motion excites: the vibration that it leaves in a unit oscil
 .. math:: \ddot x + 2\zeta\omega\dot x + \omega^2 x = -\ddot q_j, \qquad
     \hat x_j = \frac1\omega\Bigl|\int_0^T \ddot q_j\,e^{p(T-t)}\,dt\Bigr|
 
-is the amplitude at its end T. The part that appears at the tip depends on the arm; the part that a shaper leaves does
-not.
+is the amplitude at the end T of the motion. How much of it appears at the tip depends on the arm; the fraction that a
+shaper leaves does not.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ from flexarm_dynamics.errors import TrajectoryError
 
 from .recommendation import BY_PROGRAMME, SMOOTH, box, impulses, train_of
 
-#: Types of the node `shaper` that can be recommended; ``none`` if nothing is needed.
+#: Types of the node `shaper` that can be recommended; ``none`` if no shaper is needed.
 NODE = KINDS
 #: Times per period of the fastest mode, and their maximum total number.
 PER_PERIOD, MOST = 40, 200_000
@@ -31,18 +31,18 @@ def read(path):
     Parameters
     ----------
     path : str or Path
-        YAML, whose ``joint_names`` are taken, or CSV with columns ``q1`` and so on.
+        YAML with ``joint_names``, or CSV with columns ``q1`` and so on.
 
     Raises
     ------
     TrajectoryError
-        With file, place and value.
+        Naming file, place and value.
     """
     return files.read(path, _joint_names(Path(path)))
 
 
 def _joint_names(path):
-    """The joints that a file names or numbers, for `files.read`, which checks them; one if that is unknown."""
+    """The joints that a file names or numbers, for `files.read`, which checks them; one joint if that is unknown."""
     import yaml
 
     try:
@@ -66,7 +66,7 @@ def _joint_names(path):
 
 
 def steps(trajectory, fastest):
-    """The motion as small steps of the speed at equal times, from its first point to its last.
+    """The motion as small steps of the speed at equally spaced times, from its first point to its last.
 
     Parameters
     ----------
@@ -128,9 +128,9 @@ def of_trajectory(trajectory, spreads, candidates, retimed=None):
     trajectory : JointTrajectoryData
     spreads : sequence of Spread
     candidates : sequence of Candidate
-        Those with a kernel; ``least_exciting`` is left out. The first is ``none``.
+        Those with a kernel are used; ``least_exciting`` is left out. The first is ``none``.
     retimed : tuple of Candidate and JointTrajectoryData, optional
-        As of `retiming.retimed`.
+        From `retiming.retimed`.
 
     Returns
     -------
@@ -177,14 +177,14 @@ def _row(candidate, time, amplitudes):
 
 
 def recommended(rows, residual):
-    """The row of the node's quickest shaper that leaves at most the wanted residual, or of the one that leaves least.
+    """The row of the node's quickest shaper that leaves at most the wanted residual; if none does, the one with least.
 
     Parameters
     ----------
     rows : list of dict
-        As of `of_trajectory`.
+        From `of_trajectory`.
     residual : float
-        Wanted [-].
+        Wanted residual [-].
     """
     own = [row for row in rows if row["kind"] in NODE]
     enough = [row for row in own if row["residual"] <= residual]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Joins the same mode from several windows: spread of frequency and damping, and dependence on the joints.
 
-Between configurations the frequency is :math:`f(q) = f_0 + g\cdot(q - \bar q)`, by least squares weighted with the
-intervals, if this predicts left-out windows better than a constant does.
+Between configurations the frequency is :math:`f(q) = f_0 + g\cdot(q - \bar q)`, fitted by least squares that are
+weighted with the intervals. It is used if it predicts left-out windows clearly better than a constant does.
 """
 
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ import numpy as np
 
 #: Modes are different if the logarithms of their frequencies differ by more than this [-].
 GAP = 0.2
-#: An amplitude is divided by this power of omega to get that of a deflection.
+#: An amplitude divided by this power of omega is the amplitude of a deflection.
 POWERS = {"linear_acceleration": 2, "acceleration": 2, "velocity": 1, "angular_velocity": 1}
-#: A fit over the joints is used if its error for left-out windows is below this fraction of that of the mean [-].
+#: A fit over the joints is used if its error for left-out windows is below this fraction of the mean's error [-].
 BETTER = 0.6
 #: A joint that moves less than this between the windows has no slope [rad or m].
 MOVES = 0.02
@@ -26,7 +26,7 @@ class Family:
     Attributes
     ----------
     modes : tuple of Mode
-        One per window in which it rings.
+        One per window in which the mode rings.
     windows : tuple of int
         Indices of these windows.
     part : float
@@ -67,11 +67,11 @@ class Dependence:
     mean : ndarray, shape (n,)
         Mean configuration [rad].
     frequency : float
-        There [Hz].
+        Frequency at the mean configuration [Hz].
     slope : ndarray, shape (n,)
         [Hz/rad]
     error, constant_error : float
-        Rms error of its prediction, and of that by the mean, for a left-out window [Hz].
+        Rms error of its prediction for a left-out window, and of the prediction by the mean [Hz].
     """
 
     mean: np.ndarray
@@ -109,8 +109,8 @@ def families(windows, quantities):
     if not all_modes:
         return []
     squares = np.array([_deflections(mode, quantities) ** 2 for mode, _ in all_modes])
-    # All quantities have the same weight, whatever their units. Within a quantity, a channel that rings more counts
-    # more.
+    # All quantities have the same weight, independent of their units. Within a quantity, channels that ring more have
+    # more weight.
     size = {
         q: squares[:, [k for k, of in enumerate(quantities) if of == q]].sum() for q in quantities
     }
@@ -146,7 +146,7 @@ def _groups(all_modes, members):
 
 
 def dependence(family, windows):
-    """How a family's frequency depends on the joints; None if too few windows show it.
+    """How a family's frequency depends on the joints; None if too few windows have it, or no joint moved between them.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ def draw(made, path):
     Raises
     ------
     FlexarmError
-        For a path that is not that of a picture.
+        If the path is not that of a picture.
     """
     path = check_file(path, "--figure")
     figure = plt.figure(figsize=(13.0, 8.0), layout="constrained")

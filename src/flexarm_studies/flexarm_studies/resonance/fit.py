@@ -4,13 +4,13 @@ r"""Fits frequencies and damping of modes in several channels by least squares, 
 .. math:: y_c(t) = \sum_k \mathrm{Re}\{a_{kc} e^{p_k t} + b_{kc}\,(e^{p_k\cdot} * u)(t)\} + d_c u(t) + g_c + h_c t,
     \qquad p_k = -\sigma_k + j\omega_k
 
-with an input u, the motion of a sweep; without an input it is free ringing. The a, b, d, g, h are linear and solved for
-at every p (variable projection, Golub & Pereyra 1973). The fit starts from the poles of `pencil`. A mode is left out if
-this improves the Bayesian information criterion.
+where the input u is the motion of a sweep; without an input it is free ringing. The coefficients a, b, d, g, h are
+linear; the fit solves for them at every p (variable projection, Golub & Pereyra 1973). It starts from the poles of
+`pencil`. A mode is left out if this improves the Bayesian information criterion.
 
 The errors of :math:`\omega,\sigma` are :math:`(J'J)^{-1}J'SJ(J'J)^{-1}` with the Jacobian J and the covariance S of the
-residuals. The J of a mode is narrow in frequency, so only S near the mode matters: it is the spectral density of the
-residuals of all channels together, smoothed over some neighbouring lines.
+residuals. The J of a mode is narrow in frequency, so only S near the mode matters. S is the spectral density of the
+residuals of all channels together, smoothed over some neighbouring spectral lines.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from . import pencil
 TURN = 2.0 * np.pi
 #: Largest and smallest damping ratio of a ringing mode [-].
 MAX_DAMPING, MIN_DAMPING = 0.3, 1e-5
-#: Modes whose interval of the frequency, over the frequency, is wider are dropped [-].
+#: A mode is dropped if the half-width of its frequency's interval, over the frequency, is larger than this [-].
 MAX_WIDTH = 0.1
 #: A mode is left out if its rms is below this fraction of the largest in every channel [-].
 MIN_PART = 0.02
@@ -32,7 +32,7 @@ MIN_PART = 0.02
 OVER_NOISE = 20.0
 #: Poles of a sweep whose distance, over their size, is less than this are one mode [-].
 SWEPT_TWIN = 0.08
-#: Max. number of modes, and lines over which the residuals' spectrum is smoothed.
+#: Max. number of modes, and number of spectral lines on either side over which the residuals' spectrum is smoothed.
 MAX_MODES, SMOOTHED = 6, 4
 #: Samples per period of the highest frequency; if there are more, they are averaged.
 PER_PERIOD = 4.0
@@ -78,7 +78,7 @@ class Fit:
     modes : tuple of Mode
         Ascending.
     explained : ndarray, shape (c,)
-        Fraction of each channel's variance about a straight line [-].
+        Fraction of each channel's variance about a straight line that the fit explains [-].
     time : ndarray, shape (s,)
         Times of the samples of the fit, from the window's first sample [s].
     measured, fitted : ndarray, shape (s, c)
@@ -104,9 +104,9 @@ def fit(values, period, low=0.0, high=HIGHEST, motion=None, direct=None) -> Fit:
     low, high : float
         Frequencies [Hz].
     motion : ndarray, shape (s, m), optional
-        What moves the arm, for example accelerations of the joints; None: nothing moves it.
+        Input that moves the arm, for example accelerations of the joints; None: nothing moves it.
     direct : ndarray, shape (s, d), optional
-        What the channels contain directly of the motion, for example its speed and its way.
+        Signals of the motion that the channels contain directly, for example its speed and its position.
 
     Returns
     -------
@@ -236,7 +236,7 @@ def _criterion(problem, solution):
 
 
 def _select(problem, start, low, high):
-    """Fit all possible modes, and leave out one after the other while this is better."""
+    """Fit all possible modes, then leave out one after the other while this improves the criterion."""
     solution = _solve(problem, start)
     while len(solution.poles):
         odd = _odd(problem, solution, low, high)
@@ -266,7 +266,7 @@ def _odd(problem, solution, low, high):
     for k, most in enumerate((MAX_WIDTH, MAX_DAMPING)):
         bad |= ~(np.abs(widths[:, k, k]) < (most * poles.imag / NORMAL) ** 2)
     if bad.any():
-        # The most damped first. Two of them that cancel each other are large, so modes look small beside them.
+        # The most damped one first. Two bad poles that cancel each other have large parts, so modes look small.
         return int(np.argmax(np.where(bad, ratio, -1.0)))
     power = _power(problem, solution)
     bad = (power < MIN_PART**2 * power.max(axis=0)).all(axis=1)
@@ -285,7 +285,7 @@ def _odd(problem, solution, low, high):
 
 
 def _power(problem, solution):
-    """Sum of the squares of the part of each mode in each channel, shape (k, c)."""
+    """Sum of squares of each mode's part of each channel, shape (k, c)."""
     B, first = problem.basis(solution.poles), problem.fixed.shape[1]
     each = (B.shape[1] - first) // len(solution.poles)
     parts = [slice(first + each * k, first + each * (k + 1)) for k in range(len(solution.poles))]
@@ -347,7 +347,7 @@ def _modes(problem, solution, size, live, block):
 
 
 def _through(pole, motion, period):
-    """The motion (s, m), straight between samples, through 1 / (s - pole), shape (s, m), complex."""
+    """The motion (s, m), linear between samples, filtered by 1 / (s - pole), shape (s, m), complex."""
     z = pole * period
     grown = np.exp(z)
     # First-order hold: exact for straight lines between the samples.
@@ -364,7 +364,7 @@ def impulse_responses(values, motion, floor=1e-3):
     motion : ndarray, shape (s, m)
         At rest at both ends.
     floor : float
-        Floor of the motion's power, relative to the largest: where the power is less, the response fades [-].
+        Floor of the motion's power, relative to the largest power; where the power is lower, the response fades [-].
 
     Returns
     -------

@@ -11,7 +11,7 @@ from .windows import Window
 
 #: Max. time from sending a motion to its begin [s].
 LATEST = 0.5
-#: Delays of the swept way that a channel may contain directly, caused by the position loops [s].
+#: Delays with which a channel may contain the swept position directly, because of the position loops [s].
 LAGS = (0.0, 0.025, 0.05, 0.1, 0.15)
 
 
@@ -24,7 +24,7 @@ def rings(recording, motion, begin, wishes):
         With the joint positions.
     motion : RingingMotion
     begin : float
-        Time when it was sent, as the recording counts it [s].
+        Time when the motion was sent, as the recording counts it [s].
     wishes : Wishes
 
     Returns

@@ -7,8 +7,8 @@ each, so it rings freely. ``sweep``: each joint swings with
 .. math:: x = A(f)\sin\varphi(t),\quad \dot\varphi = 2\pi f,\quad f = f_1(f_2/f_1)^{t/T},\quad
     A = 0.9\min\Bigl(d, \frac{v}{2\pi f}, \frac{a}{(2\pi f)^2}\Bigr)
 
-faded in and out, and rests. The points have positions and velocities, with cubics in between, as in every trajectory
-controller.
+faded in and out, and rests. The points have positions and velocities; between them the motion is cubic, as in every
+trajectory controller.
 """
 
 from abc import ABC, abstractmethod
@@ -22,13 +22,13 @@ from flexarm_dynamics.errors import FlexarmError
 
 #: Fraction of the bounds that a motion uses [-].
 USED = 0.9
-#: A sweep is made smaller if it would use more than this fraction [-].
+#: A sweep is made smaller if it would use more than this fraction of the bounds [-].
 MOST = 0.97
 #: Points per second of a sweep, and of the check.
 RATE, CHECKED = 100.0, 1000.0
 #: Fraction of a sweep in which it is faded in, and out [-].
 FADED = 0.1
-#: After a motion's end, free ringing begins when the controller has settled, after this time [s].
+#: Time after a motion's end until the controller has settled and free ringing begins [s].
 SETTLED = 0.2
 #: If speeds are not measured, they are differences of positions over this time [s].
 OVER = 0.02
@@ -46,7 +46,7 @@ class Bounds:
     stop_travel, stop_velocity : float
         Bounds of the measured joints; beyond these the measurement stops [rad], [rad/s].
     silence : float
-        Time without joint states after which it stops, too [s].
+        Max. time without joint states; after it the measurement stops, too [s].
     """
 
     travel: float = 0.05
@@ -109,7 +109,7 @@ class RingingMotion:
         return [spline, spline.derivative(), spline.derivative(2)]
 
     def derivative(self, order, time):
-        """A derivative (0: position, to 2) at times (k,) [s], shape (k, n); at rest before and after."""
+        """Derivative of an `order` from 0 (position) to 2 at times (k,) [s], shape (k, n); at rest before and after."""
         time = np.asarray(time, float)
         values = self._splines[order](np.clip(time, 0.0, self.times[-1]))
         moves = (time >= 0.0) & (time < self.times[-1])
@@ -194,7 +194,7 @@ def _sweep(bounds, band, duration):
     hertz = low * (high / low) ** (fine / duration)
     phase = 2.0 * np.pi * low * duration / np.log(high / low) * (hertz / low - 1.0)
     omega = 2.0 * np.pi * hertz
-    # A smooth minimum: corners of the amplitude would cause steps of the speed.
+    # A smooth minimum, because corners of the amplitude would cause steps of the speed.
     limits = (1.0 / bounds.travel, omega / bounds.velocity, omega**2 / bounds.acceleration)
     amplitude = USED * sum(limit**4 for limit in limits) ** -0.25
     edge = np.clip(np.minimum(fine, duration - fine) / (FADED * duration), 0.0, 1.0)
@@ -202,7 +202,7 @@ def _sweep(bounds, band, duration):
     velocity = np.gradient(position, fine, edge_order=2)
     velocity[[0, -1]] = position[[0, -1]] = 0.0
     time, position, velocity = fine[::20], position[::20], velocity[::20]
-    # Fading in, and a quick sweep, need more than the momentary sine.
+    # Fading in and a quick sweep need more speed and acceleration than the momentary sine.
     spline = BPoly.from_derivatives(time, np.stack([position, velocity], axis=1))
     near = np.linspace(0.0, duration, int(CHECKED * duration) + 1)
     limits = (bounds.travel, bounds.velocity, bounds.acceleration)
@@ -269,9 +269,9 @@ class Arm(ABC):
 
     @abstractmethod
     def sample(self, patience):
-        """The next joint state: clock [s], position and velocity (n,) [rad], [rad/s]; None after a `patience` [s].
+        """The next joint state: clock [s], position and velocity (n,) [rad], [rad/s].
 
-        The velocity is None if it is not measured.
+        None if no state arrives within `patience` [s]. The velocity is None if it is not measured.
         """
 
     @abstractmethod
@@ -280,7 +280,7 @@ class Arm(ABC):
 
     @abstractmethod
     def stop(self):
-        """Stop the arm, and discard its present motion."""
+        """Stop the arm and discard its current motion."""
 
     @abstractmethod
     def streams(self):
@@ -310,7 +310,7 @@ class Watch:
         clock : float
             [s]
         position, velocity : ndarray, shape (n,)
-            [rad], [rad/s]; without velocities they are taken from the positions.
+            [rad], [rad/s]; without velocities, differences of the positions are used.
 
         Raises
         ------
@@ -328,7 +328,7 @@ class Watch:
         )
 
     def _difference(self, clock, position):
-        """Mean speed since the last sample that is `OVER` ago."""
+        """Mean speed since a reference sample, over at least `OVER`; the reference is replaced when it is that old."""
         if self._last is None:
             self._last = clock, position
             return np.zeros_like(position)
@@ -362,7 +362,7 @@ def measure(arm, motion, bounds, settle=1.0):
     motion : RingingMotion
     bounds : Bounds
     settle : float
-        Time for which the arm must stand before the motion [s].
+        Time for which the arm must stand still before the motion [s].
 
     Returns
     -------
@@ -372,7 +372,7 @@ def measure(arm, motion, bounds, settle=1.0):
     Raises
     ------
     FlexarmError
-        If the arm does not stand before, leaves its bounds, or sends no more states.
+        If the arm does not stand still before the motion, leaves its bounds, or sends no more states.
     """
     check(motion, bounds)
     start = _standing(arm, bounds, settle)
@@ -391,7 +391,7 @@ def measure(arm, motion, bounds, settle=1.0):
 
 
 def _standing(arm, bounds, settle):
-    """Position of the arm; refused if it moves by a tenth of the motion's distance."""
+    """Position of the arm at rest; refused if the arm moves by a tenth of the motion's distance."""
     clock, start, _ = _next(arm, bounds)
     watch, end = Watch(arm.joint_names, start, bounds), clock + settle
     while clock < end:

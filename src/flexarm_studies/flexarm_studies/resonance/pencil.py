@@ -20,7 +20,8 @@ from scipy.linalg import eigh
 MAX_COLUMNS, MAX_SAMPLES = 350, 1500
 #: Largest order; every second one is tried.
 MAX_ORDER = 40
-#: Two poles are the same if they differ by less than this fraction of their size [-] and this over the duration [rad].
+#: Two poles are the same if they differ by less than the sum of this fraction of their size [-] and this angle over the
+#: duration [rad].
 SAME, RESOLVED = 0.015, 0.4
 #: Number of orders in which a pole must be the same.
 STABLE = 2
@@ -32,7 +33,7 @@ def stable_poles(values, period, low, high, max_damping):
     Parameters
     ----------
     values : ndarray, shape (s, c)
-        Each channel about a straight line, of size 1 or so.
+        Each channel minus its straight line, scaled to about 1.
     period : float
         [s]
     low, high : float
@@ -43,7 +44,7 @@ def stable_poles(values, period, low, high, max_damping):
     Returns
     -------
     list of complex
-        :math:`-\sigma + j\omega` [1/s], those that most orders have first.
+        :math:`-\sigma + j\omega` [1/s]; poles that occur in most orders come first.
     """
     near = RESOLVED / (period * min(len(values), MAX_SAMPLES))
     return _clusters(orders(values, period), near, low, high, max_damping)
@@ -70,7 +71,7 @@ def orders(values, period):
 
 
 def _clusters(of_orders, near, low, high, max_damping):
-    """Poles that stay from one order to the next, joined by frequency."""
+    """Poles that stay the same from one order to the next, grouped by frequency."""
     kept = [[p for p in poles if _rings(p, low, high, max_damping)] for poles in of_orders]
     stable = [
         p

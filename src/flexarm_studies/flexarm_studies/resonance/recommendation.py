@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Recommends the shaper, or the smoothing, that leaves at most the wanted vibration with the smallest delay.
 
-Every candidate is a kernel with which a motion is convolved. At its end, L later, it leaves the fraction
+Every candidate is a kernel with which a motion is convolved. The motion then ends later by L and leaves the fraction
 
 .. math:: V(p) = \left|\int_0^L k(\tau)\,e^{p(L-\tau)}\,d\tau\right|
 
-of the vibration of a mode with the pole p. Impulses are the shapers of `flexarm_control.motions.shapers`. A jerk limit
-is the kernel 1/W on [0, W], with :math:`V = |(e^{pW} - 1)/(pW)|`: steps of the acceleration become ramps of the length
-W. A snap limit consists of two of these. None of them increases speeds or accelerations.
+of the vibration of a mode with the pole p. The shapers of `flexarm_control.motions.shapers` are kernels of impulses. A
+jerk limit is the kernel 1/W on [0, W], with :math:`V = |(e^{pW} - 1)/(pW)|`: steps of the acceleration become ramps of
+the length W. A snap limit consists of two such kernels. None of them increases speeds or accelerations.
 
 For several modes the residual is :math:`\sqrt{\sum_k s_k V_k^2}`. Here :math:`s_k` is the fraction of the vibration's
 energy that mode k had in the recording, and :math:`V_k` is the largest V over its spread of frequency and damping.
@@ -27,7 +27,8 @@ TURN = 2.0 * np.pi
 POINTS = 41
 #: Number of widths of a smoothing that are tried, and the largest in periods of the slowest mode.
 WIDTHS, PERIODS = 400, 5.0
-#: The shaper by a linear programme, its minimum and maximum length in periods of the lowest mode, and steps to find it.
+#: Name of the shaper by a linear programme, its min. and max. length in periods of the lowest mode, and number of
+#: bisection steps to find the length.
 ROBUST, SHORTEST, LONGEST, HALVINGS = "robust", 0.25, 3.0, 6
 #: Frequencies may be off by this fraction at most, as in the node [-].
 WIDEST = 0.5
@@ -38,7 +39,7 @@ BY_PROGRAMME = "least_exciting"
 
 @dataclass(frozen=True)
 class Spread:
-    """What is known of a mode.
+    """What is known about a mode.
 
     Attributes
     ----------
@@ -81,7 +82,7 @@ class Candidate:
     kind : str
         Of `shapers.SHAPERS`, ``none``, of `SMOOTH`, or ``least_exciting``.
     modes : tuple of int
-        Modes for which it is made; empty for a smoothing.
+        Modes for which it is designed; empty for a smoothing.
     delay : float
         Time by which a motion gets longer [s].
     residual : float
@@ -89,7 +90,7 @@ class Candidate:
     nominal : float
         Residual in the middle of the spread [-].
     width : float
-        Width of a smoothing's box [s]; 0 for others.
+        Width of a smoothing's box [s]; 0 for other kinds.
     spread, periods : float
         For ``robust``: fraction by which the frequencies may be off, and length in periods of the lowest mode [-].
     """
@@ -111,11 +112,11 @@ class Recommendation:
     Attributes
     ----------
     wanted : float
-        Residual [-].
+        Wanted residual [-].
     candidates : tuple of Candidate
-        The quickest of each kind that meets the residual, or the best of its kind if none does.
+        Of each kind the quickest that meets the residual, or the best one if none does.
     chosen : Candidate
-        A shaper: the quickest that meets the residual, or the best.
+        The quickest shaper that meets the residual, or the best one if none does.
     """
 
     wanted: float
@@ -150,7 +151,7 @@ def recommend(spreads, residual=0.05, move=None) -> Recommendation:
     Raises
     ------
     FlexarmError
-        Without a mode, or for a residual out of range.
+        If there is no mode, or the residual is out of range.
     """
     if not 0.0 < residual < 1.0:
         raise FlexarmError(
@@ -195,7 +196,7 @@ def impulses(train):
 
 
 def _robust(spreads, residual):
-    """The shortest robust shaper that meets the residual, for the most important mode, or for more."""
+    """The shortest robust shaper that meets the residual, designed for the most important mode or for more modes."""
     order = sorted(range(len(spreads)), key=lambda k: -spreads[k].part)
     return _quickest(
         [_robust_for(tuple(sorted(order[: k + 1])), spreads, residual) for k in range(len(order))],
@@ -227,7 +228,7 @@ def _robust_for(modes, spreads, residual):
 
 
 def train_of(kind, modes, spread=0.0, periods=1.0):
-    """The `Shaper` of a kind for the middle of some spreads, or for some modes; without any, a single impulse.
+    """The `Shaper` of a kind for some modes, at the middle of their spreads; a single impulse for no modes.
 
     Parameters
     ----------
@@ -271,7 +272,7 @@ def _smoothing(kind, spreads, residual):
 def _least_exciting(spreads, residual, move):
     part = np.array([s.part for s in spreads])
     part = part / part.sum()
-    # At poles of modes that hardly take part, the residual may be larger.
+    # At poles of modes that hardly contribute, the residual may be larger.
     wanted = residual / np.sqrt(np.maximum(part * len(part), 1e-6))
     poles = [s.poles() for s in spreads]
     longer = PERIODS / min(s.low for s in spreads)

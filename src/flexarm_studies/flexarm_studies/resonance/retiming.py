@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds the shaper type ``retimed`` for a motion: the shortest new time law that leaves at most the wanted vibration.
 
-`flexarm_control.shaping.time_law` predicts what it leaves: for each mode the largest vibration over its spread, divided
-by the largest that the unshaped motion leaves. Several modes are combined as in `recommendation`.
+`flexarm_control.shaping.time_law` predicts what a time law leaves: for each mode the largest vibration over its spread,
+divided by the largest vibration that the unshaped motion leaves. Several modes are combined as in `recommendation`.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from flexarm_dynamics.parameters import check_all
 from .recommendation import LONGEST, SHORTEST, WIDEST, Candidate
 
 RETIMED = modes_module.RETIMED
-#: Number of steps to find the shortest one.
+#: Number of bisection steps to find the shortest time law.
 HALVINGS = 5
 #: Fraction by which frequencies may be off if they were measured in several configurations, as in the node [-].
 SPREAD = 0.15
@@ -45,7 +45,7 @@ def retimed(trajectory, spreads, places, residual):
     trajectory : JointTrajectoryData
     spreads : sequence of Spread
     places : sequence of (ndarray, list of Spread)
-        Configurations [rad] and the modes there; empty: they are the same everywhere.
+        Configurations [rad] and the modes there; if empty, the modes are the same everywhere.
     residual : float
         Wanted residual [-].
 

@@ -49,7 +49,7 @@ class SimulatedArm(Arm):
         self.stopped = False
 
     def sample(self, patience):
-        """As in `Arm`; it always sends states."""
+        """As in `Arm`; never None, because this arm always sends states."""
         simulator, loop = self._simulator, self._loop
         tips = []
         for k in range(round(DRIVE_RATE / COMMAND_RATE)):
@@ -69,12 +69,12 @@ class SimulatedArm(Arm):
         self._loop.command(self._simulator.time, start + motion.derivative(0, time)[0])
 
     def move(self, motion, start):
-        """As in `Arm`: with the next command."""
+        """As in `Arm`; the motion begins with the next command."""
         self.begin = self._simulator.time
         self._motion = motion, np.asarray(start, float), self.begin
 
     def stop(self):
-        """As in `Arm`: it holds its position."""
+        """As in `Arm`; the arm then holds its position."""
         self._motion, self.stopped = None, True
         self._loop.command(self._simulator.time, self._simulator.position)
 

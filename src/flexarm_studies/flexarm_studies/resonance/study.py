@@ -13,7 +13,7 @@ from .fit import HIGHEST
 from .recommendation import BY_PROGRAMME, LONGEST, WIDEST, Spread, recommend, widened
 from .time_law import Move
 
-#: A mode with less than this fraction of the vibration's energy is not shaped for [-].
+#: The shaper ignores a mode with less than this fraction of the vibration's energy [-].
 MIN_PART = 1e-3
 #: Configurations closer than this count as one [rad].
 SAME_PLACE = 0.05
@@ -28,15 +28,15 @@ class Wishes:
     Attributes
     ----------
     residual : float
-        Vibration that may be left [-].
+        Fraction of the vibration that may be left [-].
     margin : float
-        Fraction by which frequencies may be off beyond the measured spread [-].
+        Fraction by which frequencies may be off in addition to the measured spread [-].
     low, high : float
-        Range of frequencies that are searched [Hz].
+        Range of frequencies that is searched [Hz].
     windows : tuple of (float, float)
-        Begin and end of each [s]; empty: they are found.
+        Begin and end of each window [s]; if empty, the windows are found automatically.
     quantities : tuple of str
-        Empty: all that exist.
+        Quantities that are used; if empty, as in `windows.channels`.
     move : Move
         Motion for the least exciting time law.
     """
@@ -60,10 +60,10 @@ class Study:
     windows : list of Window
     families : list of Family
     spreads : list of Spread
-        Of each family, widened.
+        Of each family, widened by the margin.
     recommendation : Recommendation
     answers : tuple of Answer
-        Responses of sensors to steps of the joints, if the arm was moved by these.
+        Responses of sensors to steps of the joints, if the arm was moved by steps.
     """
 
     channels: windows.Channels
@@ -86,7 +86,7 @@ def study(recordings, wishes=None) -> Study:
     Raises
     ------
     FlexarmError
-        If nothing rings, a window has no samples, or a recording has other channels than the first.
+        If nothing rings, a window has no samples, or a recording has channels that differ from those of the first.
     """
     wishes = wishes or Wishes()
     first, rings = None, []
@@ -126,7 +126,7 @@ def of_windows(found, rings, wishes) -> Study:
     Raises
     ------
     FlexarmError
-        If none does.
+        If no window rings.
     """
     if not rings:
         hint = "record what follows a quick motion or a blow, or name a stretch with --window"
@@ -273,7 +273,7 @@ def yaml_lines(made, motion=None):
     ----------
     made : Study
     motion : list of dict, optional
-        As from `of_trajectory`: the lines are those of the shaper recommended for this motion.
+        From `of_trajectory`; the lines are then for the shaper recommended for this motion.
     """
     kind, modes, spread, periods = _recommended(made, motion)
     shaped = [made.spreads[k] for k in modes]
@@ -292,7 +292,7 @@ def yaml_lines(made, motion=None):
     if made.channels.joint_names:
         lines.insert(2, f"    joint_names: [{', '.join(made.channels.joint_names)}]")
     if periods:
-        # Rounded up: the printed number covers what was found.
+        # Rounded up, so that the printed number covers the value found.
         up = lambda value, most: min(float(np.ceil(1e3 * value)) / 1e3, most)  # noqa: E731
         spread, periods = up(spread, WIDEST), up(periods, LONGEST)
         lines += [f"    shaper.spread: {spread}", f"    shaper.periods: {periods}"]
@@ -427,6 +427,6 @@ def of_trajectory(made, trajectory):
     wanted, joints = made.recommendation.wanted, trajectory.positions.shape[1]
     places = by_configuration(made, range(len(made.spreads)))
     if len(made.channels.joint_names) != joints:
-        places = []  # of other joints
+        places = []  # they are for other joints
     law = retiming.retimed(trajectory, made.spreads, places, wanted)
     return effect.of_trajectory(trajectory, made.spreads, made.recommendation.candidates, law)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Finds the quickest motion from rest to rest that leaves at most the wanted vibration, within speed and acceleration.
 
-The acceleration is linear between N times, with the values a. The remaining vibration of a mode is linear in a, so
+The acceleration is linear between its values a at equal times. The remaining vibration of a mode is linear in a, so
 
 .. math:: \min_{a,\rho}\ \rho \quad\text{with}\quad |a_i| \le a_{max},\; 0 \le v_i \le v_{max},\; v(T) = 0,\;
     s(T) = D,\; \Bigl|\int_0^T a\,e^{p(T-t)}dt\Bigr| \le \rho\,w_p\,\frac{4a_{max}}{|p|}
 
 is a linear programme for each duration T, with the modulus bounded by an octagon. Bisection finds the shortest T with
-:math:`\rho \le 1`. The trapezoidal motion within the same limits leaves :math:`4a_{max}/|p|` if its four corners add
-up, and :math:`w_p` is the wanted residual of the mode.
+:math:`\rho \le 1`. The trapezoidal motion within the same limits leaves :math:`4a_{max}/|p|` if its four corners excite
+the mode in phase. :math:`w_p` is the wanted residual of the mode.
 """
 
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ class Move:
 
 
 def least_exciting_duration(move, poles, wanted, longer):
-    """Duration of the quickest motion that leaves at most the wanted residuals, and what it leaves.
+    """Duration of the quickest motion that leaves at most the wanted residuals, and the residuals of this motion.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def least_exciting_duration(move, poles, wanted, longer):
     wanted : sequence of float
         Residual of each mode [-].
     longer : float
-        Time by which it may be longer than the trapezoidal motion [s].
+        Time by which the motion may be longer than the trapezoidal motion [s].
 
     Returns
     -------
@@ -88,7 +88,7 @@ def least_exciting_duration(move, poles, wanted, longer):
     Raises
     ------
     FlexarmError
-        If there is none within the limits.
+        If there is no such motion within the limits.
     """
     thin = [p[:: max(len(p) // POLES, 1)] for p in poles]
     low, high = move.duration, move.duration + longer
@@ -106,7 +106,7 @@ def least_exciting_duration(move, poles, wanted, longer):
 
 
 def solve(move, poles, wanted, duration):
-    """The acceleration at equal times that leaves least in a given time; None if the limits contradict each other.
+    """The acceleration that leaves least vibration in a given duration; None if the limits contradict each other.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def solve(move, poles, wanted, duration):
     Returns
     -------
     acceleration : ndarray, shape (N + 1,)
-        At times from 0 to the duration [1/s^2].
+        At equally spaced times from 0 to the duration [1/s^2].
     residuals : ndarray, shape (m,)
         Largest residual of each mode [-].
     """

@@ -11,15 +11,16 @@ from ..identification.recording import SIGNALS, kind_of
 from ..recordings import rest
 from .fit import HIGHEST, Fit, fit
 
-#: Quantities that ring while the joints rest, and their substitutes, of which the first available is used.
+#: Quantities that ring while the joints rest, and their substitutes; the first available substitute is used.
 RINGING = ("strain", "amplitude", "linear_acceleration", "angular_velocity")
 INSTEAD = ("velocity", "position", "torque", "current")
 #: The joints move if one goes farther than this [rad or m].
 MOVES = 5e-3
 #: A fit is used if it explains this fraction of some channel's variance.
 EXPLAINED = 0.8
-#: For the envelope without joints: its block [s]; its minimum at the begin and at the end of a window, over the
-#: quietest fiftieth [-]; and its increase that counts as a blow and ends a window [-].
+#: For the envelope, which is used if the recorded joints do not move or never rest: the length of its blocks [s]; its
+#: minimum at the begin and at the end of a window, over the quietest fiftieth [-]; and the increase that counts as a
+#: blow and ends a window [-].
 BLOCK, BEGIN, END, RISE = 0.25, 2.0, 1.3, 1.6
 #: A shorter window does not count [s].
 SHORTEST = 0.3
@@ -73,7 +74,7 @@ class Channels:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A stretch that rings.
+    """A stretch of a recording that rings.
 
     Attributes
     ----------
@@ -97,12 +98,12 @@ def channels(recording, quantities=None) -> Channels:
     ----------
     recording : Recording
     quantities : sequence of str, optional
-        Of `SIGNALS`; not given: all available ones of `RINGING`, or the first available one of `INSTEAD`.
+        Names of `SIGNALS`; if not given, all available ones of `RINGING`, or else the first available one of `INSTEAD`.
 
     Raises
     ------
     FlexarmError
-        If no channel of these has all its values.
+        If no channel of these quantities has all its values.
     """
     found = {q: list(_of(recording, q)) for q in quantities or SIGNALS}
     if quantities is None:
@@ -132,7 +133,7 @@ def _of(recording, quantity):
 
 
 def free(found, recording):
-    """Stretches in which nothing moves the arm: its joints rest, or an envelope falls.
+    """Stretches in which nothing moves the arm: its joints rest, or the envelope of the channels falls.
 
     Parameters
     ----------
@@ -152,7 +153,7 @@ def free(found, recording):
 
 
 def falling(values, period):
-    """Stretches of `values` (s, c), a row per `period` [s], whose envelope falls from above the quietest blocks."""
+    """Stretches of `values` (s, c), a row per `period` [s], whose envelope falls and is above the quietest blocks."""
     block = max(round(BLOCK / period), 2)
     count = len(values) // block
     if count < 4:

@@ -2,14 +2,15 @@
 r"""Tunes baselines for an arm and its motion with the data of a design: arm file, uncertain set, rate, delay.
 
 The uncertain set is the arm at start, middle and end of its motion, with `PAYLOADS` times its payload and one mode
-more. The arm is linearised and sampled at `RATE`, with its torque at once and one sample late. Only the part that
-torque reaches is used.
+more. The arm is linearised and sampled at `RATE`: once with a torque that acts at once, and once with a torque that
+acts one sample late. Only the part of the state that torque reaches is used.
 
 - Joint PID, with the weight and friction of the rigid arm along the reference, and each joint's own inertia times its
   acceleration. The integral is also used without gravity, because a PD alone sticks where friction lets it. The
-  reference is shaped (ZVD or EI) for the modes that ring under the PID at the motion's end. Gains must be stable on the
-  whole set. They have the shortest settling time of the linear arm on the shaped motion, for the worst of all payloads.
-  If only its poles were optimised, the PID would be so soft that it does not change the modes' own damping.
+  reference is shaped (ZV, ZVD or EI) for the modes that ring under the PID at the motion's end, or it is not shaped.
+  Gains must be stable on the whole set. They have the shortest settling time of the linear arm on the shaped motion,
+  for the worst of all payloads. If only its poles were optimised, the PID would be so soft that it does not change the
+  modes' own damping.
 - Joint PID with strain feedback: the same PID without a shaper. For each joint that bends a link with a gauge, it feeds
   back the moment :math:`\mu` that this link's innermost gauge shows, relative to the moment :math:`\mu_r` of the
   reference's motion, and its rate. Both gains are tuned with those of the PID, by the same measure (Luo, Direct strain
@@ -24,11 +25,11 @@ torque reaches is used.
 .. math:: \max_{cases,\,p} d(p) + c\,\overline{\max(d(p),\,-1)}, \qquad
     d(p) = \frac{\mathrm{Re}\,p}{\omega_1}\max\Bigl(1, \frac{|p|}{b\,\omega_1}\Bigr).
 
-plus the logarithm of the factor by which the sensors' noise in the torque is too large; it may be as large as in a
-design (`NOISIEST`). Without this bound the gains are so high that an encoder's count takes a tenth of the torque, and
-counts alone make the loop oscillate. Poles beyond b = `BAND` count less, because no gain changes the decay of the
-highest modes, only that of the others. The second term is a tie-break (c = `TIE`): of two gains with the same slowest
-pole, it prefers the one that damps the others better.
+plus the decadic logarithm of the factor by which the sensors' noise in the torque is too large. The noise may be as
+large as in a design (`NOISIEST`). Without this bound the gains are so high that an encoder's count takes a tenth of the
+torque, and counts alone make the loop oscillate. Poles beyond b = `BAND` count less, because gains change the decay of
+the other modes, but not that of the highest ones. The second term is a tie-break (c = `TIE`): of two gains with the
+same slowest pole, it prefers the one that damps the others better.
 """
 
 from dataclasses import dataclass
@@ -339,7 +340,8 @@ def settling(task, gains, train):
     """Settling time of a PID on the motion of a `task`, shaped by a `train`, from its unshaped end on [periods].
 
     The arm is the linear one at the motion's end, with the worst of `PAYLOADS`; the tip is as in `trial`. If the tip is
-    not settled after `NEVER` periods, the logarithm of its distance over the tolerance is added.
+    not settled after `NEVER` periods, the result is `NEVER` plus the decadic logarithm of the tip's largest distance in
+    the last period over the tolerance, at most 0.4 `NEVER`.
     """
     times = np.arange(0.0, task.profile.duration + NEVER * task.case.period, 1.0 / RATE)
     r, rd, rdd = _reference(task, train, times)

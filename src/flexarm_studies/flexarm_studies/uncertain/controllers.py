@@ -25,7 +25,7 @@ def _tutorial(feedforward, case):
 
 
 def _designed(feedforward, case):
-    """Take it from the cache of designs if it is there."""
+    """`Setup` of the arm's design, which is taken from the cache of designs if it is there."""
     start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
     settings = Settings(rate=RATE, delay=DELAY, configurations=(middle, start, end))
     found = default(case.read(), settings, Uncertainty())

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-#: A mode whose torque, over that of a mode that moves with the hub, is below this is not reached by torque [-].
+#: Torque does not reach a mode if the mode's torque on the joints is below this fraction of the torque of a mode that
+#: moves with the hub [-].
 REACHED = 1e-6
 #: Largest amplitude of a mode for the derivative of the tip [m], [rad].
 STEP = 1e-6
@@ -72,7 +73,7 @@ def ringing(plant, q):
         tip = np.linalg.norm(plant.tip_position(q, sag + step * shape) - rest) / step
         held = np.inf
         if reached:
-            # A joint on which the mode does not act turns at no amplitude.
+            # A joint on which the mode does not act does not turn, whatever the amplitude.
             bears = np.divide(friction, torque, out=np.full(n, np.inf), where=torque > 0.0)
             held = float(bears.min() * tip / (np.sqrt(2.0) * plant.arm.reach))
         found.append(Ringing(float(np.sqrt(square)) / (2.0 * np.pi), reached, held))

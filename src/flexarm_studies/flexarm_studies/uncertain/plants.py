@@ -102,7 +102,7 @@ def names_for(arm, names=tuple(VARIANTS)):
 def _possible(arm, variant):
     damped = any(any(f.damping) for link in arm.links for f in link.flexible.values())
     if variant.damping != 1.0 and not damped:
-        return False  # a multiple of nothing
+        return False  # a factor of no damping changes nothing
     try:
         plant_of(arm, variant)
     except ModelError:

@@ -8,8 +8,8 @@ end of the reference. A heavier payload sags more. Joint torques can't change th
 Joint errors and vibration are errors. The tip is settled when it is within `TOLERANCE` of the reach from that place,
 and stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`.
 
-Torque does not return in a ramp here (`return_time` 0): a motion begins with the first torque. A real arm is held
-first, so that its ramp is over.
+The torque does not return in a ramp here (`return_time` 0): a motion begins with the first torque. A real arm is held
+before its motion, so the ramp is over by then.
 
 Integration: dop853 is used if a few substeps are short enough for the highest mode and for the friction of light hubs.
 Friction damps a joint that reverses at the rate :math:`f_cH/v_0`, with the inverse H of the mass matrix and the
@@ -45,10 +45,10 @@ TOLERANCE = 1e-3
 WINDOW, REST = 6.0, 1.0
 #: The run after the motion is at least this long: a loop may be slow on a fast arm [s].
 MIN_WINDOW = 2.0
-#: For the effect of noise alone the arm is only held, for this many times that window: by then nothing else is left
-#: [-].
+#: To find the effect of noise alone, the arm is only held, for this many times the window after the motion. By then
+#: every other vibration has died out [-].
 HOLD = 2.0
-#: Its motion has no distance and is short: a long motion takes long to plan [s].
+#: Start and end of its motion, which has no distance and is short: a long motion takes long to plan [s].
 SHORT = 0.1, 0.2
 #: Joints are at rest within this of the reference [deg].
 JOINT_REST = 0.02
@@ -226,7 +226,10 @@ def _mobility(plant, q):
 
 
 def longest_step(model, q):
-    r"""Step of the implicit method, :math:`\min(h, \sqrt{\kappa/f_cH})` with the inverse H of the mass matrix [s].
+    r"""Step of the implicit method, :math:`\min(h, \sqrt{\kappa/f_cH})` [s].
+
+    h is `STEP`, :math:`\kappa` is `KICK`, :math:`f_c` the Coulomb friction, and H the diagonal of the inverse mass
+    matrix.
 
     Parameters
     ----------

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes the cases: random arms, an arm on an elastic base, one link with payloads, each with three motions.
 
-Durations are drawn from the seed, in periods of the lowest mode with joints locked: by chance, a trapezoid leaves
-nothing of a mode if its ramps are whole periods. The drives compensate the weight with the payload that they know.
+Durations are drawn at random from the seed, in periods of the lowest mode with joints locked. Fixed durations could
+flatter the trapezoid: it leaves nothing of a mode if its ramps happen to be whole periods. The drives compensate the
+weight with the payload that they know.
 """
 
 from dataclasses import dataclass
@@ -18,8 +19,8 @@ from flexarm_dynamics.models import model
 from ..random_arms import generator
 from .time_laws import trapezoid
 
-#: Ranges of the durations of the three motions, in locked periods; start and end of each as fractions of the arm's own
-#: way.
+#: Ranges of the durations of the three motions, in locked periods; start and end of each motion, as fractions of the
+#: way between the two positions of the case.
 DURATIONS = ((2.0, 2.4), (2.4, 3.0), (3.0, 4.0))
 WAYS = ((0.0, 0.7), (0.0, 1.0), (1.0, 0.0))
 #: Payloads of the arm with one link, as multiples of its own.
@@ -48,7 +49,7 @@ class Case:
 
 
 def motions(start, end, period, rng):
-    """Three motions between two positions (n,) [rad]; `period` [s]; durations by `rng`."""
+    """Three motions between the positions `start` and `end` (n,) [rad]; `rng` draws durations in each `period` [s]."""
     found = []
     for (low, high), (first, last) in zip(DURATIONS, WAYS, strict=True):
         ends = (start + part * (end - start) for part in (first, last))
@@ -93,7 +94,7 @@ def elastic_base(seed=0) -> Case:
     return _case("elastic base", arm, arm, start, end, seed)
 
 
-#: An aluminium strip with a payload, on a hub as light as that of a direct drive.
+#: An aluminium strip with a payload, on a hub with the low inertia of a direct drive.
 ONE_LINK = """
 name: one_link
 description: A strip with a payload on a light hub

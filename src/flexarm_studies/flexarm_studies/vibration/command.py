@@ -121,7 +121,7 @@ def _show(lines, path, where):
 
 
 def _more_time(rows, count, seed):
-    """The table of what `retimed` leaves in `report.TIMES` for the motions that it misses, and its markers."""
+    """The table of what `retimed` leaves in `report.TIMES`, for motions above its wanted residual, and its markers."""
     known, missed = _missed(rows, count, seed, ("retimed",))
     found = [
         (row, study.in_more_time(known[row["arm"]], row["motion"], report.TIMES)) for row in missed
@@ -130,7 +130,7 @@ def _more_time(rows, count, seed):
 
 
 def _more_places(rows, count, seed):
-    """The table of what `retimed` leaves with modes at `report.PLACES` for motions that it misses, and its markers."""
+    """The table of what `retimed` leaves with modes at `report.PLACES`, for motions that it misses, and its markers."""
     known, missed = _missed(rows, count, seed, report.LISTED)
     found = [
         (row, study.at_more_places(known[row["arm"]], row["motion"], report.PLACES, off))
@@ -140,14 +140,14 @@ def _more_places(rows, count, seed):
 
 
 def _limits(rows, count, seed):
-    """The table of the least that a time law leaves for the motions that `retimed` misses, and its markers."""
+    """The table of the least that a time law leaves, for the motions that `retimed` misses, and its markers."""
     known, missed = _missed(rows, count, seed, ("retimed",))
     found = [(row, study.at_least(known[row["arm"]], row["motion"])) for row in missed]
     return report.limit_table(found), report.LIMIT
 
 
 def _in_trials(rows, count, seed):
-    """The table of what `retimed` leaves after corrections for the motions that it misses, and its markers."""
+    """The table of what `retimed` leaves after corrections, for motions above its wanted residual, and its markers."""
     known, missed = _missed(rows, count, seed, report.LISTED)
     found = [
         (row, study.in_trials(known[row["arm"]], row["motion"], report.CORRECTIONS, off))
@@ -157,7 +157,7 @@ def _in_trials(rows, count, seed):
 
 
 def _missed(rows, count, seed, methods):
-    """Cases by name, and the rows of some methods that exceed the wanted residual."""
+    """Cases by name, and the rows of motions that some methods miss, that is, that exceed the wanted residual."""
     known = {case.name: case for case in (make() for make in cases.all_of(count, seed).values())}
     return known, [row for row, _ in report.missed(rows, methods)]
 

@@ -41,9 +41,9 @@ def way(swing, period):
     Parameters
     ----------
     swing : Swing
-        Of several periods after the motion.
+        It has several periods after the motion.
     period : float
-        Period of the swing; the mean over it is the place of rest [s].
+        Period of the swing; the mean over the last period is the place of rest [s].
     """
     rest = swing.tip[swing.time > swing.time[-1] - period].mean(axis=0)
     away = swing.tip - rest

@@ -2,17 +2,17 @@
 r"""Finds the least vibration that any time law can leave after a motion, on the simulated arm itself.
 
 A time law of `flexarm_control.shaping.time_law` has the accelerations x at its inner nodes. Its modes are not used
-here. The motion of the tip y in a window after the end is linearised by differences, :math:`\partial y/\partial x`;
-each column is a simulated motion. Then
+here. The motion y of the tip in a window after the end is linearised by differences, :math:`\partial y/\partial x`;
+each column needs a simulated motion. Then
 
 .. math:: \min_{\delta, c, e} \lVert e\rVert \quad\text{with}\quad
     \lvert y_i(t) + (\partial y_i/\partial x)\,\delta - c_i\rvert \le e_i, \quad |\delta_k| \le r, \quad
     |\ddot\sigma| \le a,\; 0 \le \dot\sigma \le v,\; \dot\sigma(T) = 0,\; \sigma(T) = 1
 
-is a linear programme over time t and axes i, with the norm as the largest over its `directions`. The steps
-:math:`\delta` are taken while the simulated residual falls; otherwise the radius r is halved. This is successive linear
-programming with a trust region (Palacios-Gomez, Lasdon & Engquist 1982). Its result is feasible; a smaller residual
-elsewhere, far from the start, is not excluded.
+is a linear programme over time t and axes i. The norm is approximated by the largest component along the `directions`.
+A step :math:`\delta` is taken if the simulated residual falls; otherwise the radius r is halved. This is successive
+linear programming with a trust region (Palacios-Gomez, Lasdon & Engquist 1982). Its result is feasible, but there may
+be a smaller residual elsewhere, far from the start.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ ANGLES = 9
 
 
 def least(arm, law, x, window):
-    """The residual of a time law, and the least that is found from there on.
+    """The residual of a time law, and the least residual that the search finds from there.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def _change(law, x, free, slope, tip, radius):
     """The change of x within a radius that leaves least according to the linearisation."""
     velocity, acceleration = law.limits
     size, now = max(np.ptp(tip, axis=0).max(), 1e-12), law.inner @ x
-    # The unknowns: steps along `free`, the middle and half the width of each axis's swing, the norm.
+    # The unknowns are the steps along `free`, the middle and half the width of each axis's swing, and the norm.
     steps, middle, half, norm = np.split(np.eye(free.shape[1] + 7), [-7, -4, -1])
     rows, limits = [directions() @ half - norm], [np.zeros(ANGLES**2)]
     for axis in range(3):
@@ -108,7 +108,7 @@ def _change(law, x, free, slope, tip, radius):
 
 
 def directions():
-    """Unit vectors (k, 3) with no negative component: the norm of such a vector is about its largest part along one."""
+    """Unit vectors (k, 3) for the norm of a vector without negative components: its largest component along them."""
     turns = np.linspace(0.0, 0.5 * np.pi, ANGLES)
     first, second = (each.ravel() for each in np.meshgrid(turns, turns))
     return np.stack(

@@ -10,14 +10,14 @@ from flexarm_dynamics.parameters import check_all
 from flexarm_sim.plant import Plant
 from flexarm_sim.position_loop import PARAMETERS, PositionLoop
 
-#: Samples of the drives per second, and of the commands; delay of these [Hz], [Hz], [s].
+#: Rate of the drives, rate of the commands, and delay of the commands [Hz], [Hz], [s].
 DRIVE_RATE, COMMAND_RATE, DELAY = 1000.0, 125.0, 0.008
 #: Bandwidth of the drives: this many times the lowest mode with joints locked [-], within these limits [rad/s].
 TIMES, BANDWIDTH = 4.0, (20.0, 125.0)
 #: Factor by which an unstable loop is made slower, and max. number of times.
 SLOWER, ATTEMPTS = 0.7, 20
-#: A plant whose drives make an explicit method need more substeps per sample of the drives than this is integrated
-#: implicitly: a light joint behind a flexible link takes thousands.
+#: If an explicit method would need more substeps per sample of the drives than this, because of the drives' gains, the
+#: plant is integrated implicitly. A light joint behind a flexible link needs thousands.
 MAX_SUBSTEPS = 1000
 #: The tip is evaluated at every second sample.
 TIP_EVERY = 2
@@ -45,7 +45,7 @@ class Swing:
     saturated: bool
 
     def residual(self, window):
-        """Amplitude of the tip after the end, over a `window` [s]: half of its range, of all axes together [m]."""
+        """Amplitude of the tip in a `window` [s] after the end: norm of half of its range along each axis [m]."""
         after = self.tip[(self.time >= self.end) & (self.time <= self.end + window)]
         return float(np.linalg.norm(0.5 * np.ptp(after, axis=0)))
 
@@ -98,7 +98,7 @@ class PositionArm:
         Parameters
         ----------
         motion : object
-            With `position` of times (k,) [s], (k, n) [rad], and `duration` [s].
+            Its `position` maps times (k,) [s] to (k, n) [rad]; it has a `duration` [s].
         after : float
             Time for which the tip is evaluated afterwards [s].
         """

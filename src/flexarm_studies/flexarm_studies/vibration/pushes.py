@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pushes one link behind a position loop aside and releases it: how fast it comes to rest, damped by a sensor and not.
 
-The data of the damping are measured on the same simulated arm, behind the same drives, with its actual payload:
-frequency and damping from the ringing after a small motion, and the response to corrections from a burst of the
-command.
+The parameters of the damping are measured on the same simulated arm, behind the same drives, with its actual payload.
+Frequency and damping ratio come from the ringing after a small motion; the response to corrections comes from a burst
+of the command.
 """
 
 from dataclasses import dataclass
@@ -34,9 +34,9 @@ IMU_NOISE, IMU_SCALE = 0.05, 40.0
 WAY = np.array([1.2])
 #: Amplitude of the burst [rad], and number of periods of ringing recorded with it.
 BURST, LISTEN = 0.01, 6.0
-#: Periods for which the release is watched, and fraction of the first swing at which it has decayed [-].
+#: Periods for which the tip is watched after the release, and fraction of its first distance at which it has decayed.
 WATCHED, DECAYED = 36.0, 0.1
-#: The damping is also made for frequencies that are off by this fraction, either way.
+#: The damping is also designed for frequencies that are too low and too high by this fraction [-].
 OFF = strain_damping.MARGIN
 COLUMNS = (
     "payload",
@@ -70,7 +70,7 @@ class Decay:
     phase : float
         Phase of its response to corrections [rad].
     without, damped : float
-        Time until the tip swings less than `DECAYED` of its first swing [s].
+        Time until the tip stays within `DECAYED` of its first distance from rest, without and with damping [s].
     low, high : float
         The same, damped for a frequency that is too low, or too high, by `OFF` [s].
     other : float
@@ -78,13 +78,13 @@ class Decay:
     noisy : float
         The same, damped, with noise of `NOISY` [s].
     largest : float
-        Correction [rad].
+        Largest correction [rad].
     motion : float
         Residual swing after the case's first motion, damped over not damped [-].
     imu : float
-        The time, damped by an accelerometer at the tip in place of strain [s].
+        As `damped`, with an accelerometer at the tip in place of strain [s].
     imu_motion : float
-        The residual swing with that [-].
+        As `motion`, with the accelerometer [-].
     """
 
     payload: float
@@ -143,7 +143,7 @@ class Bench:
         pushed : float
             First modal amplitude at the start [m].
         noise : float
-            Noise of the sensor; not given: the usual one.
+            Rms noise of the sensor, in its unit; if not given, the usual noise.
 
         Returns
         -------
@@ -207,7 +207,7 @@ def prepared(payload, seed=0, imu=False):
 
 
 def decay(payload, seed=0) -> Decay:
-    """Push one link with `payload` times its payload, with and without damping; `seed` of the case."""
+    """Push one link with `payload` times its payload, with and without damping; `seed` is that of the case."""
     case, bench, settings = prepared(payload, seed)
     known = settings if payload == 1.0 else prepared(1.0, seed)[2]
     still = np.zeros(int(WATCHED * case.period / PERIOD))
@@ -242,7 +242,7 @@ def _no_correction(*_):
 
 
 def _law(settings, factor=1.0):
-    """The damping, at rest before the push, with its frequency times a factor."""
+    """The damping, at rest before the push, with its frequency multiplied by a factor."""
     changed = {**settings, "frequency": settings["frequency"] * factor}
     damping = strain_damping.StrainDamping(changed, PERIOD)
     damping.update(-PERIOD, 0.0)
@@ -250,7 +250,7 @@ def _law(settings, factor=1.0):
 
 
 def _time(tip):
-    """Time from which the tip (k, 3) stays within `DECAYED` of its first swing [s]."""
+    """Time from which the tip (k, 3) stays within `DECAYED` of its first distance from its last place [s]."""
     away = np.linalg.norm(tip - tip[-1], axis=1)
     over = np.flatnonzero(away > DECAYED * away[0])
     return float(over[-1] + 1) * PERIOD

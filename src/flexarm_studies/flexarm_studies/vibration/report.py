@@ -8,7 +8,7 @@ from .study import METHODS
 
 BEGIN, END = "<!-- vibration: begin -->", "<!-- vibration: end -->"
 TIME = "<!-- more time: begin -->", "<!-- more time: end -->"
-#: Periods by which a motion may get longer: one, as in the tables, and more [-].
+#: Periods by which a motion may get longer: one as in the other tables, and more [-].
 TIMES = (1.0, 1.5, 2.0, 3.0)
 BENT = "<!-- bent: begin -->", "<!-- bent: end -->"
 #: Numbers of places along a motion at which its modes are measured.

@@ -26,27 +26,27 @@ from . import limit
 from .position_arm import PositionArm
 from .time_laws import jerk_limited, resampled, trapezoid
 
-#: The kick after which ringing is measured: fraction of the way, duration and recorded time in locked periods.
+#: The kick after which ringing is measured: fraction of the way [-], and duration and recorded time in locked periods.
 KICK, KICK_PERIODS, LISTEN = 0.05, 0.8, 14.0
 #: Window of the residual, in locked periods.
 WINDOW = 1.5
-#: Min. fraction of the largest amplitude, max. damping, and max. number of the shaped modes.
+#: Of the shaped modes: min. amplitude over the largest one [-], max. damping ratio [-], and max. number.
 AUDIBLE, MAX_DAMPING, MAX_MODES = 0.03, 0.3, 3
 #: Modes closer than this fraction count as one.
 SAME = 0.12
-#: Modes of the two ends of a motion that are closer than this fraction are given once.
+#: If modes of the two ends of a motion are closer than this fraction, only one of them is used.
 ALIKE = 0.02
 #: Largest factor by which a mode changes from one configuration on the way to the next.
 CHANGE = 2.0
 #: The tip is recorded for this much longer than it is evaluated [s].
 LATE = 0.02
-#: MoveIt's resampling, a usual rise time of the acceleration [s], and the tried error of frequencies [-].
+#: Period of MoveIt's resampling [s], a usual rise time of the acceleration [s], and the tested frequency error [-].
 RESAMPLE, RISE, OFF = 0.1, 0.05, 0.15
 #: Methods by TOPP-RA and by Ruckig.
 QUICKEST = ("toppra", "ruckig, one period")
 #: Factors of the frequencies for the methods by a new time law [-].
 OFFS = {"retimed": 1.0, "retimed -15 %": 1.0 - OFF, "retimed +15 %": 1.0 + OFF}
-#: A path bends aside by this fraction of its largest way [-]; the unshaped motion and the methods that shape it.
+#: A path bends aside by this fraction of its largest way [-]. `BENT`: methods for it, the unshaped motion first.
 ASIDE = 0.25
 BENT = ("trapezoid", "robust, both ends", "robust, both ends -15 %", "robust, both ends +15 %")
 METHODS = (
@@ -96,7 +96,7 @@ def measured(arm, at, way, period) -> Measured:
     ----------
     arm : PositionArm
     at, way : (n,) ndarrays
-        End of the kick, and the way of which it is the last part, `KICK` [rad].
+        End of the kick, and the way; the kick is the last part of it, the fraction `KICK` [rad].
     period : float
         Approximate period of the lowest mode [s].
     """
@@ -153,11 +153,11 @@ def together(found, other) -> Measured:
 
 
 def rows(found, others, count=None):
-    """Modes at several places of a motion as rows, with each mode in its own column, as many as ring at any place.
+    """Modes at several places of a motion as rows, each mode in its own column; by default the max. number at a place.
 
-    Modes keep their order of frequency along the way. If fewer are found at a place, two of them are close to each
-    other, or one is silent there; then one counts for both. A mode that would change by more than `CHANGE` from row to
-    row stays as it is.
+    Modes keep their order of frequency along the way. If fewer modes are found at a place, two of them are close to
+    each other, or one does not ring there; then one mode counts for both. A mode that would change by more than the
+    factor `CHANGE` from row to row keeps its values.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def rows(found, others, count=None):
     others : sequence of Measured
         Modes at earlier places, from the end to the start.
     count : int, optional
-        Number of modes, the loudest ones.
+        Number of modes; the ones with the largest amplitudes are used.
 
     Returns
     -------
@@ -176,7 +176,7 @@ def rows(found, others, count=None):
     places = [*reversed(others), found]
     counts = [place.frequencies.size for place in places]
     count = count or max(counts)
-    # Of places with the same number, take the last: the ringing at the end counts.
+    # Of places with the same number, use the last one: the ringing at the end counts.
     known = max(range(len(places)), key=lambda k: (min(counts[k], count), k))
     made = {known: _ascending(places[known], count)}
     for k in (*range(known - 1, -1, -1), *range(known + 1, len(places))):
@@ -198,7 +198,7 @@ def _continued(place, after, count):
 
 
 def _ascending(found, count):
-    """The `count` loudest modes by frequency, (2, k)."""
+    """The `count` modes with the largest amplitudes, by frequency, (2, k)."""
     modes = np.stack([found.frequencies, found.dampings])[:, :count]
     return modes[:, np.argsort(modes[0])]
 
@@ -235,14 +235,14 @@ def _modes(motion, along, off, periods=1.0):
 
 
 def quickest(motion, rise):
-    """The motion's line, timed by TOPP-RA and by Ruckig, within the speed and acceleration of the motion, a dict.
+    """The motion's straight path, timed by TOPP-RA and by Ruckig within the motion's speed and acceleration, a dict.
 
     Parameters
     ----------
     motion : PiecewiseMotion
         A trapezoid of speed.
     rise : float
-        Acceleration over jerk, for Ruckig [s].
+        Ratio of acceleration to jerk, for Ruckig [s].
     """
     speed, bend = (
         np.abs(motion.derivative(k, motion.knots[1:] - 1e-9)).max(axis=0) for k in (1, 2)
@@ -264,7 +264,7 @@ def candidates(motion, found, middle, other, methods=METHODS):
     ----------
     motion : PiecewiseMotion
     found, middle, other : Measured
-        At its end; half-way; at its start.
+        Modes at its end, half-way, and at its start.
     methods : sequence of str
     """
     lowest, both = 1.0 / found.frequencies.min(), together(found, other)
@@ -335,7 +335,7 @@ def run_bent(case):
         if motion.start.size == 1:
             continue
         given = bent(motion)
-        # Ways of the kicks, as long as the motion's way: forwards to the path's end, and backwards to its start.
+        # The kicks' ways are as long as the motion's way: forwards to the path's end, and backwards to its start.
         first, last = (given.position(t * given.duration) for t in np.array([[0.1], [0.9]]))
         size = np.linalg.norm(motion.angle)
         ways = [
@@ -353,7 +353,7 @@ def run_bent(case):
 
 
 def bent(motion):
-    """The quickest motion by TOPP-RA from start to end around a bend, by `ASIDE` of the largest way.
+    """The quickest motion by TOPP-RA from start to end on a path that bends aside by `ASIDE` of the largest way.
 
     All joints stay within the largest speed and acceleration of any of them in the given motion.
 
@@ -436,7 +436,7 @@ def at_more_places(case, number, counts, off=1.0):
     number : int
         Of the motion.
     counts : sequence of int
-        Places from start to end, with both.
+        Numbers of places from start to end, including both.
     off : float
         Factor of the frequencies, that is, their assumed error [-].
 
@@ -493,8 +493,8 @@ def at_least(case, number):
 def _prepared(case, number, at_end=False):
     """The arm of a case, a motion by its number, the modes at its end and along it, and what it leaves [m].
 
-    With `at_end`, along it there are only as many modes as ring at the end, because the ringing after a trial shows
-    only these.
+    With `at_end`, only as many modes are used along the motion as ring at its end, because the ringing after a trial
+    shows only these.
     """
     arm, motion = _arm(case), case.motions[number]
     end = measured(arm, motion.end, motion.angle, case.period)

@@ -16,7 +16,7 @@ RAMP = 1.0 / 3.0
 
 
 def trapezoid(start, end, duration):
-    """Return the motion with a trapezoid of speed, as points with velocities: cubic polynomials have it exactly.
+    """Return the motion with a trapezoid of speed, as points with velocities; cubic polynomials represent it exactly.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def resampled(motion, period):
     ----------
     motion : PiecewiseMotion
     period : float
-        0.1 s unless set otherwise [s].
+        MoveIt's default is 0.1 s [s].
     """
     times = np.append(np.arange(0.0, motion.duration - 1e-9, period), motion.duration)
     states = list(motion.states(times))
@@ -57,7 +57,7 @@ def jerk_limited(motion, width):
     Parameters
     ----------
     motion : PiecewiseMotion
-        Of cubic polynomials at most.
+        Its polynomials are cubic at most.
     width : float
         Acceleration over jerk, by which the motion gets longer [s].
     """

@@ -16,7 +16,7 @@ from . import moving
 from .listening import Tolerances, check_layout, check_listening
 from .samples import Finding, Received, Verdict, samples
 
-#: Half the duration of a jolt forth and back; duration for which torques that must be refused are sent [s].
+#: Half the duration of a jolt forward and backward; duration for which torques that must be refused are sent [s].
 JOLT, REFUSED = 0.15, 0.15
 #: Time for which states are answered with DISABLED before a push, so that they name this program [s].
 CLAIM = 0.05
@@ -129,7 +129,7 @@ class Conversation:
         self.send(message, np.zeros(len(self._arm.joints)), mode=self._kind.DISABLED)
 
     def claim(self):
-        """Answer states with DISABLED for a while, so the driver expects torque from here; return what has come."""
+        """Answer states with DISABLED for a while, so the driver expects torque from here; return the states."""
         return self.listen(CLAIM, lambda _, message: self.disable(message))
 
     def alone(self):

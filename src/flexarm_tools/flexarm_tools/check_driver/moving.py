@@ -5,9 +5,9 @@ Joint j is pushed by one period of a sine,
 
 .. math:: u(t) = \bar u + A\,e_j\,\sin(2\pi t/T), \qquad B_{jj}\,A\,T^2/(2\pi) = \Delta q
 
-which leaves the slow subsystem (10) at rest, :math:`\Delta q` further; :math:`\bar u` holds the arm's weight. T is long
-compared with the longest period of the links. The model of the arm file moves under the same torque, with the driver's
-stamps and the torque that it reports. Each measured signal y is compared with its prediction p: the factor
+which moves the slow subsystem (10) by :math:`\Delta q` and leaves it at rest; :math:`\bar u` holds the arm's weight. T
+is long compared with the longest period of the links. The model of the arm file moves under the same torque, with the
+driver's stamps and the torque that it reports. Each measured signal y is compared with its prediction p: the factor
 :math:`y^Tp/p^Tp` is 1 if they agree.
 """
 
@@ -68,7 +68,7 @@ class Push:
         return out
 
     def jolt(self, time, part):
-        """Half the amplitude forth for `part` seconds, then back; it ends at rest after twice that time, (n,) [N m]."""
+        """Half the amplitude forward for `part` seconds, then backward; at rest after twice that time, (n,) [N m]."""
         out = self.hold.copy()
         out[self.joint] += 0.5 * self.amplitude * (1.0 if time < part else -1.0)
         return out

@@ -103,7 +103,7 @@ class Markers:
             marker.header = header
         for name, points in (("ghost", picture.ghost), ("beam", picture.beam), ("trail", trail)):
             self._lines[name].points = _points(points)
-            # RViz complains of a line without a second point.
+            # RViz complains about a line with fewer than two points.
             self._lines[name].action = Marker.ADD if len(points) > 1 else Marker.DELETE
         self._joints.points = _points(picture.joints)
         at = self._tip.pose.position

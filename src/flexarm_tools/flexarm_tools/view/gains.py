@@ -22,7 +22,7 @@ class Gain:
     name : str
         Of the parameter.
     index : int or None
-        Which element of an array; None: the parameter is one number.
+        Index into an array; None: the parameter is a single number.
     value, low, high, step : float
         Values of the slider, in the parameter's unit.
     hint : str

@@ -89,7 +89,7 @@ class Pair:
             self._end(self._result())
 
     def _result(self):
-        """Result of both, in words: the tip's swing from crest to trough in the last second that was watched."""
+        """Result of both, in words: the tip's peak-to-peak swing in the last second that was watched."""
         swings = []
         for name in (WITH, WITHOUT):
             time, error = self.curves[name]
