@@ -284,6 +284,20 @@ class Arm:
         """Call ~/recover; whether there was a fault."""
         return self.bench.call(Trigger, f"{self.namespace}controller/recover").success
 
+    def wait_applied(self, measured=None):
+        """Wait until the driver has applied the torque for a while: a motion that begins before that may be given up.
+
+        `measured` is the tap of the driver's states, if their topic is not arm_state.
+        """
+        tap = self.measured if measured is None else measured
+        self.bench.wait_for(
+            "the driver to apply the torque", lambda: tap.newest and tap.newest.controller_id
+        )
+        seen = len(self.torques.messages)
+        self.bench.wait_for(
+            "the controller to know", lambda: len(self.torques.messages) > seen + 20
+        )
+
     def publish_trajectory(self, message):
         """Publish a trajectory, once."""
         self.bench.publisher(JointTrajectory, self.trajectories).publish(message)

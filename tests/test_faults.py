@@ -533,6 +533,7 @@ def works(arm, by=0.2):
     """Once recovered, the loop makes a small motion from where it is."""
     arm.recover()
     arm.wait_ready()
+    arm.wait_applied()
     goal = arm.state.reference_position[0] + by
     arm.offer(trajectory(J, (0.5, [goal], [0.0], [0.0])))
     arm.bench.wait_for(

@@ -706,6 +706,7 @@ def test_two_arms_side_by_side_one_killed_the_other_unaffected_topics_remapped(b
 
     goal = trajectory(["joint1"], (1.0, [0.2], [0.0], [0.0]))
     right.trajectories = "/goal"
+    right.wait_applied(measured)
     right.offer(goal)
     bench.kill("left_controller")
     bench.wait_for(
