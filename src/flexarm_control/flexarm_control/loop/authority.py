@@ -144,9 +144,8 @@ class Authority:
             self._first = False
             if (np.abs(u - self._weight) <= self._small).all():
                 self._elapsed = np.inf
-                np.clip(
-                    u, -self.limit, self.limit, out=torque
-                )  # the rest may take nearly all of it
+                # The weight alone may take nearly all of the torque.
+                np.clip(u, -self.limit, self.limit, out=torque)
                 return bool((torque != u).any())
         if self._elapsed < self._time:
             self._elapsed += dt

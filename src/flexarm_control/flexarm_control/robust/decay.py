@@ -103,6 +103,8 @@ class Poles:
     ----------
     s, asked, v : ndarray, shape (L, N)
         [1/s], d [1/s] and v [-]; v is -inf after the last one.
+    slopes : ndarray, shape (L, p, n, 3n + 2m)
+        Derivatives of the real part of the first p poles s by the gains of their loop; 0 where not known.
     """
 
     def __init__(self, stack, K):
@@ -112,7 +114,7 @@ class Poles:
         self._z, self.s = np.empty(shape, complex), np.empty(shape, complex)
         self.asked, self.v, self._count = np.empty(shape), np.empty(shape), np.empty(len(K), int)
         self._known = np.zeros(len(K), int)  # of how many first poles the gradients are known
-        self._slopes = np.zeros((len(K), 0, *K.shape[1:]))
+        self.slopes = np.zeros((len(K), 0, *K.shape[1:]))
 
     def ranking(self, wanted):
         """The call for `in_parts` that finds the poles."""
@@ -132,19 +134,14 @@ class Poles:
         """Calls for `in_parts` that find missing gradients, those of the first `count` (L,) poles of each loop."""
         if (count <= self._known).all():
             return
-        stack, before, known = self.stack, self._slopes, self._known
+        stack, before, known = self.stack, self.slopes, self._known
         self._known = count = np.maximum(count, known)
-        self._slopes = np.zeros((len(before), count.max(), *before.shape[2:]))
-        self._slopes[:, : before.shape[1]] = before
+        self.slopes = np.zeros((len(before), count.max(), *before.shape[2:]))
+        self.slopes[:, : before.shape[1]] = before
         arrays = (
-            self._H, self._tau, stack.G, stack.N, self._z, known, count, stack.period, self._slopes,
+            self._H, self._tau, stack.G, stack.N, self._z, known, count, stack.period, self.slopes,
         )  # fmt: skip
         yield compiled().pole_gradients, arrays, stack.F.shape[1]
-
-    @property
-    def slopes(self):
-        """Derivatives of the real part of poles s by the gains of their loop, (L, p, n, 3n + 2m); 0 where not known."""
-        return self._slopes
 
 
 def poles_of(stacks, gains, wanted):
