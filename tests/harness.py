@@ -290,9 +290,12 @@ class Arm:
         `measured` is the tap of the driver's states, if their topic is not arm_state.
         """
         tap = self.measured if measured is None else measured
-        self.bench.wait_for(
-            "the driver to apply the torque", lambda: tap.newest and tap.newest.controller_id
-        )
+
+        def applied():  # The newest state that came may still be one of a driver that was killed.
+            newest = tap.newest
+            return newest and newest.controller_id and newest.session == self.state.session
+
+        self.bench.wait_for("the driver to apply the torque", applied)
         seen = len(self.torques.messages)
         self.bench.wait_for(
             "the controller to know", lambda: len(self.torques.messages) > seen + 20
