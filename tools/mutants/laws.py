@@ -4,7 +4,7 @@
 from .mutant import of
 
 TESTS = "flexarm_control/test/"
-RANDOM_ARMS = "flexarm_studies/test/test_random_arms.py"
+PLANS = "flexarm_studies/test/test_plans.py flexarm_control/test/test_planner.py"
 
 ERRORS = [
     *of(
@@ -293,18 +293,36 @@ ERRORS = [
     *of(
         "flexarm_control",
         "feedforward",
-        RANDOM_ARMS,
+        PLANS,
         (
-            "preview",
+            "planner",
             "a plan that does not converge has no more derivatives",
             "KNOTS, SMALL = (80, 400), 1e-6",
             "KNOTS, SMALL = (80, 80), 1e-6",
         ),
         (
-            "preview",
+            "planner",
             "a plan beyond all bounds is not made again",
             "if finer.steps == planner.steps:",
             "if True:",
+        ),
+        (
+            "planner",
+            "modes that no torque reaches: planned at the model's frequency alone",
+            "self._like(1.0 + self.spread * part)",
+            "self._like(1.0)",
+        ),
+        (
+            "planner",
+            "modes that no torque reaches: brought to rest at the model's frequency, like the others",
+            "self.driven = coupling > UNDRIVEN * coupling.max(initial=0.0)",
+            "self.driven = coupling >= 0.0",
+        ),
+        (
+            "planner",
+            "penalised torque: values",
+            "np.linalg.solve(half, R @ free - values[active])",
+            "np.linalg.solve(half, R @ free)",
         ),
     ),
 ]

@@ -288,4 +288,4 @@ def test_modes_that_no_torque_reaches_are_named_with_what_helps():
     found = SimpleNamespace(left=(2.0 * np.pi * 3.5, 2.0 * np.pi * 22.04))
     words = _left(found)
     assert words.startswith("3.5 Hz, 22 Hz: no torque reaches these modes")
-    assert "at least three of their periods, or with shaper=zvd" in words
+    assert "feedforward preview plans" in words and "at least three of their periods" in words

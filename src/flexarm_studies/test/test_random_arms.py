@@ -11,17 +11,12 @@ import yaml
 from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control
-from flexarm_control.feedforward import base, preview
-from flexarm_control.feedforward.model import ModelFeedforward, path_of
-from flexarm_control.feedforward.preview import Preview
 from flexarm_control.robust.design import Settings, design
-from flexarm_control.trajectory import ReferenceGenerator, specs
+from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import DesignError, FlexarmError
-from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
+from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.models.fixed_step import substeps
-from flexarm_studies.loop import scenario
 from flexarm_studies.random_arms import command, generator, report, study
 from flexarm_studies.uncertain import baselines, plants, trial
 from flexarm_studies.uncertain.controllers import CONTROLLERS
@@ -48,160 +43,6 @@ def test_an_arm_with_light_hubs_has_gains_by_a_low_pass():
     law = control(model.build(found.arm), found.parameters())
     for part in (law.slow, law.fast):
         assert part.parameters["bandwidth"] == pytest.approx(found.sampling.torque_corner, rel=1e-5)
-
-
-# --------------------------------------------------------------------------- feed-forwards
-
-
-def reference_manifold(known):
-    return control(
-        known, {"slow.type": "joint_pid", "fast.type": "none", "stability_margin": -1000.0}
-    ).manifold
-
-
-def prepared(number, kind, torque=1.0):
-    """The arm's model, its motion's path, and what a feed-forward makes of it with a part of the torque limits."""
-    case = generator.arm(number)
-    known = model.build(case.read().known)
-    n = known.n_joints
-    motion = scenario.trajectory_of(case.motion, known, np.zeros(n))
-    start = np.zeros((3, n))
-    start[0] = motion.positions[0]
-    settings = base.Settings(2e-3, start[0])
-    forward = kind(known, reference_manifold(known), settings)
-    forward.limit = torque * known.arm.torque_limits
-    found = forward.prepare(motion, start)
-    reference = ReferenceGenerator(known.joint_names)
-    reference.start(start[0], 0)
-    verdict = reference.offer(motion)
-    forward.take(found, verdict.trajectory_id)
-    for k in range(20):
-        reference.sample(2_000_000 * k)
-        forward.update(reference, 2e-3 if k else 0.0)
-    assert np.abs(forward.position - reference.position).max() < np.radians(10.0)
-    return known, path_of(motion, start), found
-
-
-def test_regulators_hold_an_arm_that_its_motion_bends_where_those_of_rest_do_not():
-    known, path, found = prepared(10, ModelFeedforward)
-    state, resting = np.zeros((3, known.n_joints)), []
-    for t in np.linspace(0.0, 1e-9 * path.duration_ns, 60):
-        path.evaluate(min(round(t * 1e9), path.duration_ns - 1), state)
-        Phi, Gamma = sampled(*moving_plant(known, *state), 2e-3)
-        assert np.abs(np.linalg.eigvals(Phi - Gamma @ found.gains.at(t))).max() < 1.0, t
-        K = found.at_rest.at(t)
-        resting.append(np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max())
-        Phi, Gamma = sampled(*linear_plant(known, state[0], coulomb=False), 2e-3)
-        assert np.abs(np.linalg.eigvals(Phi - Gamma @ K)).max() < 1.0, t
-    assert max(resting) > 1.0
-
-
-def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
-    _, _, found = prepared(10, Preview, torque=0.3)
-    assert found.plan is None and found.note.startswith("preview: ")
-    assert found.gains is not None
-
-
-def test_a_plan_that_torque_binds_converges_where_it_is_linearised_often_enough(monkeypatch):
-    known, _, found = prepared(10, Preview, torque=0.5)
-    share = np.abs(found.plan.torque) / (0.5 * known.arm.torque_limits)
-    assert share.max() <= 1.0 and share.max(axis=0).min() > 0.94
-    monkeypatch.setattr(preview, "KNOTS", (80, 80))
-    assert prepared(10, Preview, torque=0.5)[2].plan is None
-
-
-def planned(monkeypatch, both=False, simpler=True):
-    """What is planned for arm 10 with a mode more, where no plan of it is found; of `both`: nor of the known arm."""
-    solve, case = preview._Planner.solve, generator.arm(10)
-    known = model.build(case.read().known)
-    fuller, n = known.fuller(known.arm.most_modes + 1), known.n_joints
-
-    def refuses(self):
-        if both or self.model.n_modes > known.n_modes:
-            raise DesignError("there is none", field="preview")
-        return solve(self)
-
-    monkeypatch.setattr(preview._Planner, "solve", refuses)
-    motion = scenario.trajectory_of(case.motion, known, np.zeros(n))
-    start = np.zeros((3, n))
-    start[0] = motion.positions[0]
-    settings = base.Settings(2e-3, start[0], known if simpler else None)
-    forward = Preview(fuller, reference_manifold(known).of(fuller), settings)
-    forward.limit = known.arm.torque_limits
-    first = forward.prepare_next(motion, start, None)
-    return known, fuller, forward.prepare_next(motion, start, replace(first, left=("plan",)))
-
-
-@pytest.mark.parametrize(("both", "note"), [(False, ""), (True, "preview: there is none")])
-def test_where_a_fuller_arm_has_no_plan_that_of_the_known_one_is_followed(both, note, monkeypatch):
-    """Where the known one has none, either: its regulated motion."""
-    known, fuller, found = planned(monkeypatch, both)
-    plan, n = found.plan, known.n_joints
-    assert found.note == note
-    assert (np.abs(plan.torque) <= known.arm.torque_limits).all()
-    further = [n + i for i, name in enumerate(fuller.mode_names) if name not in known.mode_names]
-    state = plan.state_at(0.5 * plan.duration)
-    assert state.shape == (2 * (n + fuller.n_modes),)
-    assert not state[further].any() and np.abs(state[n : n + fuller.n_modes]).max() > 1e-3
-
-
-def test_without_a_known_arm_there_is_no_other_plan(monkeypatch):
-    assert planned(monkeypatch, simpler=False)[2].plan is None
-
-
-@pytest.mark.parametrize("stabler", [preview.STABLER, preview.STABLE])
-def test_a_plan_beyond_all_bounds_is_made_again_in_shorter_steps_if_there_are(stabler, monkeypatch):
-    bend, steps = preview._Planner._bend, []
-
-    def diverges_at_first(self):
-        steps.append(self.steps)
-        x, v = bend(self)
-        return (x, v) if self.steps > steps[0] else (np.full_like(x, np.inf), v)
-
-    monkeypatch.setattr(preview._Planner, "_bend", diverges_at_first)
-    monkeypatch.setattr(preview, "STABLER", stabler)
-    _, _, found = prepared(10, Preview)
-    if stabler < preview.STABLE:
-        assert found.plan is not None and not found.note
-        assert steps[1] >= 1.9 * steps[0]
-    else:
-        assert found.plan is None and "does not stand this motion" in found.note
-        assert len(steps) == 1
-
-
-def test_a_mode_across_the_joint_is_not_planned_where_slopes_are_finite():
-    case = generator.arm(25)
-    known = model.build(case.read().known)
-    fuller = known.fuller(3, finite_slope=True)
-    motion = scenario.trajectory_of(case.motion, known, np.zeros(1))
-    start = np.stack([motion.positions[0], np.zeros(1), np.zeros(1)])
-    plan = preview._Planner(fuller, path_of(motion, start), start, known.arm.torque_limits).solve()
-    assert (np.abs(plan.torque) < 0.8 * known.arm.torque_limits).all()
-
-
-def test_a_plan_that_torque_binds_is_smooth_and_leaves_some_to_the_feedback():
-    known, _, found = prepared(10, Preview)
-    torque, limits = np.abs(found.plan.torque), known.arm.torque_limits
-    assert (torque < 0.96 * limits).all() and (torque.max(axis=0) > 0.94 * limits).any()
-
-
-def test_the_compiled_bending_of_a_plan_is_that_of_the_equations():
-    case = generator.arm(10)
-    known = model.build(case.read().known)
-    motion = scenario.trajectory_of(case.motion, known, np.zeros(2))
-    start = np.stack([motion.positions[0], np.zeros(2), np.zeros(2)])
-    planner = preview._Planner(known, path_of(motion, start), start, known.arm.torque_limits)
-    planner._along(np.zeros((2, planner.basis.shape[2])))
-    compiled = planner._bend()
-    planner.stepper = None
-    for found, wanted in zip(compiled, planner._bend(), strict=True):
-        assert_allclose(found, wanted, rtol=0.0, atol=1e-5 * np.abs(wanted).max())
-
-
-def test_a_mode_that_no_joint_moves_is_not_planned():
-    known, _, found = prepared(41, Preview)
-    assert found.plan is not None and not found.note
-    assert (np.abs(found.plan.torque) <= known.arm.torque_limits).all()
 
 
 # --------------------------------------------------------------------------- the generator

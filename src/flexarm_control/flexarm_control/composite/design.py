@@ -34,6 +34,11 @@ PARAMETERS = (
         "Kinematics of bending in the feed-forward's model, if more than the arm file states: stiffening (links keep"
         " their length), finite_slope (large slopes, too); for model chain only."
     ),
+    parameter("feedforward_spread", 0.15, "-", 0.0, 0.5).described(
+        "With preview, for modes that the joints hardly move, such as the vertical bending of an arm that only yaws: a"
+        " planned motion excites them little even if their frequencies differ from the model's by up to this fraction;"
+        " 0.0: they are left as they are."
+    ),
     parameter("motion_velocity_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
         "Corner of the observer's filter of joint speeds (observer.joint_velocity_bandwidth, if"
         " observer.measured_velocity is false). The speeds of the feed-forward's motion pass the same filter, so that"
@@ -116,7 +121,8 @@ def design(model, slow, fast, manifold=None, settings=None):
         seen += (shown(model, fuller),)
     # The manifold keeps the file's kinematics: the regulator of the fuller arm follows it and removes the difference.
     known = None if fuller is model else model
-    motion = kind(fuller, surface.of(modes), Settings(1.0 / chosen["rate"], q, known))
+    planning = Settings(1.0 / chosen["rate"], q, known, chosen["feedforward_spread"])
+    motion = kind(fuller, surface.of(modes), planning)
     together = chosen["saturation"] == "together"
     return CompositeControl(model, slow_law, fast_law, surface, motion, seen, together)
 

@@ -318,8 +318,8 @@ def _left(found):
     """The modes that no control damps, and what helps, in words."""
     listed = ", ".join(f"{omega / (2.0 * np.pi):.3g} Hz" for omega in found.left)
     return (
-        f"{listed}: no torque reaches these modes, or no gauge sees them; motions of at least three of their periods,"
-        " or with shaper=zvd, excite them little"
+        f"{listed}: no torque reaches these modes, or no gauge sees them; feedforward preview plans motions that excite"
+        " those out of reach little, and motions of at least three of their periods excite all of them little"
     )
 
 
