@@ -461,8 +461,8 @@ class Planner:
         H, right = H + rows.T @ rows, right + rows.T @ values
         limited = np.flatnonzero(np.isfinite(self.limit))
         limit = self.limit[limited]
-        here, by = (u[:, limited] / limit).ravel(), (du[:, limited] / limit[:, None])
-        by = by.reshape(here.size, -1)
+        here = (u[:, limited] / limit).ravel()
+        by = (du[:, limited] / limit[:, None]).reshape(here.size, n * count)
         change = _least(H, right, A, b)
         if (np.abs(here + by @ change) <= 1.0).all():
             return change.reshape(n, count)
