@@ -114,12 +114,13 @@ COMPARE_OUT := --json docs/comparison.json --write docs/comparison.md
 compare: build
 	@. tools/env.sh && python -m flexarm_bringup.cli compare $(if $(COMPARE_ARGS),$(COMPARE_ARGS),$(COMPARE_OUT))
 
-# The table of docs/random_arms.md, of a whole run alone. results/random_arms_*.jsonl keeps every run: after a change of
-# the code `make arms FRESH=1` starts it anew. CONTROLLERS=default,designed runs some alone.
+# The table of docs/random_arms.md, of a whole run alone. Every run is kept, those of a whole run in docs: after a change
+# of the code `make arms FRESH=1` starts anew. CONTROLLERS=default,designed runs some alone.
 ARMS_WHOLE := $(filter 100-0-,$(COUNT)-$(SEED)-$(CONTROLLERS))
 arms: build
 	@mkdir -p results && . tools/env.sh && python -m flexarm_bringup.cli arms --count $(COUNT) --seed $(SEED) \
-	--out results/random_arms_$(SEED).jsonl $(if $(FRESH),--fresh) $(if $(WORKERS),--workers $(WORKERS)) \
+	--out $(if $(ARMS_WHOLE),docs/random_arms.jsonl,results/random_arms_$(SEED).jsonl) \
+	$(if $(FRESH),--fresh) $(if $(WORKERS),--workers $(WORKERS)) \
 	$(if $(CONTROLLERS),--controllers $(CONTROLLERS)) $(if $(ARMS_WHOLE),--write docs/random_arms.md)
 
 # The table of docs/latency.md, of a whole run alone.

@@ -285,6 +285,7 @@ def test_runs_are_kept_and_not_run_again(tmp_path, monkeypatch):
 def row(number, controller, settling, **more):
     found = {
         "number": number,
+        "arm": f"arm_{number}",
         "controller": controller,
         "variant": "exact",
         "peak_joint_error_deg": 1.0 + number,
@@ -324,8 +325,10 @@ def test_what_is_wanted_of_designs_is_counted():
         *runs("exact", 0.3),
         *runs("payload x0.7", 1.0),
         *runs("payload x1.3", 1.0, residual=2e-4),  # more than the best baseline's
-        *runs("stiffness x0.9", 2.5, at_rest=False),  # later than the best baseline
-        *runs("stiffness x1.1", None, at_rest=False),
+        *runs(
+            "stiffness x0.9", 2.5, at_rest=False, rest_joint_deg=0.1
+        ),  # later than the best baseline
+        *runs("stiffness x1.1", None, at_rest=False, rest_joint_deg=0.1),
         *runs("noisy", 1.0, residual=2.9e-4, noise_tip=1e-4),
     ]
     names, table = report.reached(rows)
@@ -337,6 +340,14 @@ def test_what_is_wanted_of_designs_is_counted():
         line[2] for line in report.reached(runs("noisy", 1.0, 3.1e-4, noise_tip=1e-4))[1][1:]
     )
     assert found == "0 of 1 (0 %)"
+    assert [cells[1:] for cells in report.beaten(rows)] == [
+        ("payload x1.3", "designed", "1", "2", "2.0e-04", "1.0e-04"),
+        ("stiffness x0.9", "designed", "2.5", "2", "1.0e-04", "1.0e-04"),
+        ("stiffness x1.1", "designed", "never", "2", "1.0e-04", "1.0e-04"),
+    ]
+    lost = row(0, "designed", None, variant="payload x0.7", decay=0.3, lost="joint1 is 9 rad off")
+    (cells,) = report.beaten([lost, row(0, "pid_zvd", 2.0, variant="payload x0.7")])
+    assert cells[3] == "lost" and report.BEATEN in report.text(rows, 0)
 
 
 def test_a_share_of_less_than_all_is_not_100_percent():

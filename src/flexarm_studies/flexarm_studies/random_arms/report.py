@@ -41,6 +41,14 @@ LOUDER = (
     "arm", "design", "noisy", "noise alone", "exact", "held", "lowest mode that torque reaches [Hz]",
     "that no torque reaches [Hz]",
 )  # fmt: skip
+BEATEN = (
+    "Runs with another payload or stiffness in which the best baseline is better than the design: it settles sooner, or"
+    " leaves less."
+)
+BETTER = (
+    "arm", "plant", "design", "settled after [s]", "best baseline after [s]", "residual over the reach",
+    "best baseline's",
+)  # fmt: skip
 #: Minimum decay that is wanted of every design, over the first locked frequency [-].
 LEAST = 0.05
 #: Settling times closer than this are equal [s].
@@ -173,6 +181,34 @@ def loud(rows, seed):
         yield row["arm"], row["controller"], *words, hertz, free
 
 
+def beaten(rows):
+    """Cells of the columns `BETTER`, for each run of a design in `rows` that the best baseline beats."""
+    best, smallest = best_baseline(rows), _smallest_residual(rows)
+    for row in rows:
+        place = row["number"], row["variant"]
+        if "decay" not in row or row["variant"] not in UNSURE or place not in best:
+            continue
+        if not _no_worse(row, best, smallest):
+            after = f"{row['settling_s']:.3g}" if row.get("settled") else _unsettled(row)
+            sooner = f"{best[place]:.3g}" if np.isfinite(best[place]) else "never"
+            residuals = row.get("residual_tip"), smallest.get(place)
+            words = (None if size is None else f"{size:.1e}" for size in residuals)
+            yield row["arm"], row["variant"], row["controller"], after, sooner, *words
+
+
+def _unsettled(row):
+    return "never" if outcome(row) == "works" else outcome(row)
+
+
+def _no_worse(row, best, smallest):
+    """Whether a run settles no later and leaves no more than `best_baseline` and its `_smallest_residual`."""
+    place = row["number"], row["variant"]
+    if not row.get("settled"):
+        return not np.isfinite(best[place])
+    sooner = row["settling_s"] <= best[place] + EQUAL
+    return sooner and row["residual_tip"] <= max(smallest.get(place, np.inf), STILL)
+
+
 def _quiet(row):
     """Whether a run with noise vibrates at most `NOISE` times as much as with noise alone, or not at all."""
     found, alone = row.get("residual_tip"), row.get("noise_tip")
@@ -182,7 +218,7 @@ def _quiet(row):
 def _in_words(row):
     if outcome(row) != "works":
         return outcome(row)
-    settled = f"{_periods(row):.2g}" if row["settled"] else "never"
+    settled = f"{_periods(row):.2g}" if row["settled"] else _unsettled(row)
     return settled if row["at_rest"] else f"{settled} ({row['rest_joint_deg']:.2g}°)"
 
 
@@ -210,13 +246,6 @@ def reached(rows):
 
     def compared(row):
         return unsure(row) and (row["number"], row["variant"]) in best
-
-    def no_worse(row):
-        place = row["number"], row["variant"]
-        if not row.get("settled"):
-            return not np.isfinite(best[place])
-        sooner = row["settling_s"] <= best[place] + EQUAL
-        return sooner and row["residual_tip"] <= max(smallest.get(place, np.inf), STILL)
 
     table = [
         line("neither refused nor lost", "all", lambda row: outcome(row) == "works"),
@@ -247,7 +276,7 @@ def reached(rows):
         line(
             "the same: settled no later, and no more residual, than the best baseline",
             "95 %",
-            no_worse,
+            lambda row: _no_worse(row, best, smallest),
             compared,
         ),
         line(
@@ -321,6 +350,8 @@ def text(rows, seed):
         lines += ["", *markdown.table(DECAYS, designs)]
         variants = dict.fromkeys(row["variant"] for row in rows)
         lines += ["", MISSES, "", *markdown.table((*MISSED, *variants), missed(rows))]
+        if found := list(beaten(rows)):
+            lines += ["", BEATEN, "", *markdown.table(BETTER, found)]
         if found := list(loud(rows, seed)):
             lines += ["", LOUD, "", *markdown.table(LOUDER, found)]
     return "\n".join([*lines, "", *reasons(rows)])

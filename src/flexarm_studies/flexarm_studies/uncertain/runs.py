@@ -8,6 +8,9 @@ from flexarm_dynamics.errors import FlexarmError
 from . import trial
 from .plants import VARIANTS
 
+#: Significant digits of the numbers in a row.
+DIGITS = 6
+
 
 def key(arm, controller, variant):
     """Key of a run in a file of rows."""
@@ -54,8 +57,13 @@ def rows(case, label, controller, make, variants, seed=0):
                 "controller": controller,
                 "variant": variant,
                 "seconds": round(now - begin, 3),
-                **result,
+                **{name: _short(value) for name, value in result.items()},
             }
         )
         begin = now
     return found
+
+
+def _short(value):
+    """A number with `DIGITS` significant digits; anything else as it is."""
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
