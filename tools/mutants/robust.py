@@ -204,6 +204,12 @@ ERRORS = [
         ),
         (
             "design",
+            "low passes that end the reach: taken however much motions leave behind",
+            "found.decay > 0.0 and leaves(short, other) > leaves(task, found)",
+            "False",
+        ),
+        (
+            "design",
             "torque limits: no design is made slower",
             "if found.comes_back or slower.speed < SLOWEST:",
             "if True:",

@@ -237,9 +237,13 @@ def test_an_arm_with_coulomb_friction_sticks_with_every_payload_and_for_movement
 def test_low_passes_that_end_the_reach_are_tried_where_the_decay_is_poor(designed, monkeypatch):
     monkeypatch.setattr(design_module, "POOR", 10.0)
     monkeypatch.setattr(design_module, "WORTH", 0.0)
+    monkeypatch.setattr(design_module, "leaves", lambda task, found: 1.0)
     found = design(designed.arm, QUICK)
     corner = found.sampling.torque_corner
     assert found.omega_c == corner < designed.omega_c
+    # Gains with which motions leave more behind are not taken, whatever their decay.
+    monkeypatch.setattr(design_module, "leaves", lambda task, found: 1.0 + task.short)
+    assert design(designed.arm, QUICK).omega_c == designed.omega_c
 
 
 def test_a_low_pass_beyond_the_torque_s_reach_does_not_end_it(designed, monkeypatch):

@@ -13,7 +13,7 @@ from flexarm_control.robust import design as design_module
 from flexarm_control.robust import further
 from flexarm_control.robust import search as search_module
 from flexarm_control.robust.design import Settings, design, sampling_for
-from flexarm_control.robust.further import FURTHER, Further, leaving_less
+from flexarm_control.robust.further import FURTHER, Further, leaves, leaving_less
 from flexarm_control.robust.loop import ARM, MARGIN, STICKS, sampled_loop
 from flexarm_control.robust.recovery import Recovery
 from flexarm_control.robust.settling import (
@@ -26,6 +26,7 @@ from flexarm_control.robust.settling import (
     AfterMotion,
     Residual,
     residuals,
+    together,
 )
 from flexarm_control.robust.uncertain import Uncertainty, richer
 from flexarm_dynamics.arm import arm_file
@@ -198,6 +199,13 @@ def lasting(found):
     rest = [(0, one) for one in residuals(task.nominal, task.at[0], found.sampling, UNCERTAIN)]
     after, x = AfterMotion(search.slowest, rest), search.slowest.scaled(found.sets)
     return after(x)[0], after.settling(x), -search.value(x)
+
+
+def test_what_gains_leave_is_known_without_a_search(r):
+    task = design_module.Task(r.model.arm, r.design.settings, UNCERTAIN)
+    gains = SimpleNamespace(K=r.design.sets, sampling=r.design.sampling)
+    assert leaves(task, gains) == pytest.approx(lasting(r.design)[0], rel=1e-12)
+    assert together([]) == 0.0 and np.isinf(together([1.0, np.inf]))
 
 
 def test_a_design_whose_motions_leave_much_goes_on_for_gains_that_leave_less(r, monkeypatch):

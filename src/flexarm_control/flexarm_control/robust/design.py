@@ -27,7 +27,7 @@ from ..feedforward.model import METHOD
 from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
-from .further import LEAST, later, leaving_less
+from .further import LEAST, later, leaves, leaving_less
 from .held import held_loops
 from .loop import ARM, STICKS, Sampling
 from .noise import Noise
@@ -61,7 +61,7 @@ HARDLY, FAST = 1.0, 0.5
 FROM_LIMITS = "an arm with faster gains would not come back from them in time"
 #: If the decay of the first search is less than `POOR` times the speed, low passes with a corner below omega_c are
 #: tried. Modes beyond such a corner are only asked to keep their own damping. The result is used if its decay is more
-#: than `WORTH` times larger [-].
+#: than `WORTH` times larger, and motions leave no more behind than with the first result [-].
 POOR, WORTH = 0.25, 1.2
 #: If gains scheduled with such low passes reach less decay than this, one set for all configurations is tried as well.
 #: One set without these low passes is tried if the best decay so far is below `further.LEAST`, or, if there are no such
@@ -502,7 +502,10 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
         reached = other.decay if other is not None else -np.inf
         if max(found.decay, reached) < (LEAST if short.low_passes else LITTLE):
             found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
-        if reached > max(WORTH * found.decay, 0.0):
+        # Modes beyond the corner may ring long after a motion, although the decay that is asked of others is larger.
+        if reached > max(WORTH * found.decay, 0.0) and not (
+            found.decay > 0.0 and leaves(short, other) > leaves(task, found)
+        ):
             task, found = short, other
     if found.decay < SLOW * task.speed:
         task = Task(arm, settings, replace(uncertainty, edges=True), task.short)

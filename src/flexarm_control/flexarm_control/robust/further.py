@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from .loop import ARM, MARGIN
-from .settling import AfterMotion, residuals
+from .settling import AfterMotion, residuals, together
 
 #: The slowest pole of all loops keeps the fraction `KEEP` of the decay that was reached, and at least `LEAST`. If its
 #: decay was less than `LEAST`, it keeps all of it [-].
@@ -51,11 +51,7 @@ def leaving_less(task, found, progress, speed=None):
     """
     loops, weights = task.held(found.sampling, len(found.K))
     whole = task.search_of(loops, weights, found.sampling)
-    left = [
-        (min(k, len(found.K) - 1), one)
-        for k, q in enumerate(task.at)
-        for one in residuals(task.nominal, q, found.sampling, task.uncertainty)
-    ]
+    left = _residuals(task, found)
     after, x = AfterMotion(whole.slowest, left), whole.slowest.scaled(found.K)
     decays = whole.decays(x)
     if not left or min(decays) <= 0.0:
@@ -86,6 +82,26 @@ def leaving_less(task, found, progress, speed=None):
         return None
     used = found.evaluations + whole.evaluations + search.evaluations
     return task.sets(whole, other, used)
+
+
+def leaves(task, found):
+    """J of the `found` gains (`settling.AfterMotion`): about how late the tip settles after a motion [-].
+
+    Parameters
+    ----------
+    task : design.Task
+    found : design.Sets
+    """
+    return together([one(found.K[k])[0] for k, one in _residuals(task, found)])
+
+
+def _residuals(task, found):
+    """A `Residual` for each arm and configuration, after the number of its set of gains."""
+    return [
+        (min(k, len(found.K) - 1), one)
+        for k, q in enumerate(task.at)
+        for one in residuals(task.nominal, q, found.sampling, task.uncertainty)
+    ]
 
 
 def later(now, before):

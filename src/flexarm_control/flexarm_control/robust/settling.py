@@ -167,6 +167,14 @@ def _outer(left, right):
     return left.reshape(-1, left.shape[2]).T @ right.reshape(-1, right.shape[2])
 
 
+def together(values):
+    r"""J of all arms and configurations, :math:`(\sum_i J_i^8)^{1/8}`, from the `values` :math:`J_i`; 0 for none."""
+    most = max(values, default=0.0)
+    if not 0.0 < most < np.inf:
+        return float(most)
+    return float(most * ((np.array(values) / most) ** POWER).sum() ** (1.0 / POWER))
+
+
 class AfterMotion:
     r"""J of all arms and configurations of a design, :math:`(\sum_i J_i^8)^{1/8}`, as a function of scaled gains.
 
@@ -185,11 +193,9 @@ class AfterMotion:
         """J, and its gradient by the scaled gains x."""
         K = self._slowest.gains(x)
         rows = [residual(K[k]) for k, residual in self._residuals]
-        values = np.array([value for value, _ in rows])
-        most = values.max()
-        if not np.isfinite(most):
+        value = together([value for value, _ in rows])
+        if not np.isfinite(value):
             return np.inf, np.zeros_like(x)
-        value = most * ((values / most) ** POWER).sum() ** (1.0 / POWER) if most else 0.0
         slope = np.zeros_like(K)
         for (k, _), (one, by_gains) in zip(self._residuals, rows, strict=True):
             if one:
