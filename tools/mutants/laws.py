@@ -309,8 +309,8 @@ ERRORS = [
         (
             "planner",
             "modes that no torque reaches: planned at the model's frequency alone",
-            "self._like(1.0 + self.spread * part)",
-            "self._like(1.0)",
+            "stiffness = (1.0 + self.spread * part) ** 2",
+            "stiffness = 1.0",
         ),
         (
             "planner",

@@ -15,7 +15,7 @@ from flexarm_control.feedforward.planner import Planner
 from flexarm_control.feedforward.preview import Preview
 from flexarm_control.trajectory import ReferenceGenerator
 from flexarm_dynamics.arm.description import scaled
-from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.linear import linear_plant, moving_plant, sampled
 from flexarm_dynamics.models import model
 from flexarm_studies.loop import scenario
@@ -247,6 +247,21 @@ def test_a_plan_that_is_not_found_with_such_modes_is_made_without_them(monkeypat
     plan = ours.solve()
     assert tries == [0.15, 0.0]
     assert_allclose(plan.torque, plan_of(89, 0.0).torque)
+
+
+def test_arms_that_do_not_rest_if_they_are_softer_are_left_out(monkeypatch):
+    def folds(arm, scale):
+        raise ModelError("folds under its own weight")
+
+    monkeypatch.setattr(planner, "made", folds)
+    ours, real = planners(89, 0.15)
+    assert left_across(ours.solve(), real) < 2e-4 and ours._others == []
+
+
+def test_a_mode_that_the_motion_does_not_excite_is_not_looked_at():
+    ours, _ = planners(1, 0.15)  # no gravity, no sag
+    ours.solve()
+    assert not ours.moved.all() and ours._others is None
 
 
 def test_an_arm_whose_modes_are_all_reached_is_planned_once():

@@ -36,7 +36,7 @@ from scipy.linalg import eigh
 from scipy.optimize import nnls
 
 from flexarm_dynamics.arm.description import scaled
-from flexarm_dynamics.errors import DesignError
+from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.models.fixed_step import METHODS
 from flexarm_dynamics.models.model import made
 
@@ -75,6 +75,8 @@ STEPS_PER_PERIOD = 40.0
 #: A mode is not brought to rest if the force on it is less than this fraction of that on others [-]: the force of the
 #: joints' acceleration at the end, or the force of the shift.
 UNDRIVEN, UNMOVED = 1e-6, 1e-2
+#: Smallest force that counts as one.
+TINY = 1e-300
 #: What is left of such modes is made small at these fractions of the spread of frequencies [-], and with this weight on
 #: the amplitude of the tip over the reach, relative to the shift: rho [rad].
 SPREADS, QUIET = (-1.0, -0.5, 0.5, 1.0), 100.0
@@ -176,7 +178,8 @@ class Planner:
 
     def __init__(self, model, path, start, limit, spread=0.0, phase=STABLE, count=None):
         self.model, self.start, self.limit = model, start, limit
-        self.spread, self._path, self._phase, self._others = spread, path, phase, None
+        self.spread, self._path, self._phase = spread, path, phase
+        self._others = None  # planners of arms with other frequencies
         self.stepper = model.driven_stepper(METHODS["rk4"])
         n, m = model.n_joints, model.n_modes
         self.duration = path.duration_ns / SECOND
@@ -233,7 +236,7 @@ class Planner:
         try:
             return self._solved()
         except DesignError:
-            if not self._others:
+            if self._others is None:
                 raise
         self.spread, self._others = 0.0, None
         return self._solved()
@@ -396,7 +399,9 @@ class Planner:
         self.bends = np.vstack([self.modal @ forced[0], self.modal @ forced[1]])
         largest = np.abs(self.bends).max(axis=1).reshape(2, -1)
         each = largest * [self.planned**2, self.planned]  # scaled as forces
-        self.moved = self.driven & (each > UNMOVED * each.max(axis=1)[:, None]).all(axis=0)
+        each /= np.maximum(each.max(axis=1, initial=0.0), TINY)[:, None]
+        self.moved = self.driven & (each > UNMOVED).all(axis=0)
+        self.excited = ~self.moved & (each > UNDRIVEN).any(axis=0)
 
     def _left(self, x, v):
         """Amplitudes of the planned modes at the end, beside rest, and their rates, (2 slow,)."""
@@ -408,10 +413,10 @@ class Planner:
         The bending along the motion is (x, v). The derivatives are new if `knots`.
         """
         rows, values = np.zeros((0, c.size)), np.zeros(0)
-        if not self.spread or self.moved.all():
+        if not self.spread or not self.excited.any():
             return rows, values
         if self._others is None:
-            self._others = [self._like(1.0 + self.spread * part) for part in SPREADS]
+            self._others = list(self._alike())
         ends = [(self, x[-1], v[-1])]
         for other in self._others:
             other._along(c)
@@ -421,16 +426,22 @@ class Planner:
                 other._take_end(*finite(other._respond(np.array([0, other.steps]))[-1]))
             ends.append((other, x[-1], v[-1]))
         for arm, *end in ends:
-            which = np.tile(~arm.moved, 2)
+            which = np.tile(arm.excited, 2)
             factor = QUIET * np.concatenate([arm.shown, arm.shown / arm.planned])[which]
             rows = np.vstack([rows, factor[:, None] * arm.bends[which]])
             values = np.append(values, -factor * arm._left(*end)[which])
         return rows, values
 
-    def _like(self, ratio):
-        """The planner for an arm whose frequencies are `ratio` times as high, with the same shifts."""
-        model = made(scaled(self.model.arm, stiffness=ratio**2), self.model.origin[1])
-        return Planner(model, self._path, self.start, self.limit, 0.0, self._phase, self.count)
+    def _alike(self):
+        """Planners for arms with other frequencies, with the same shifts; softer ones may not rest at the end."""
+        for part in SPREADS:
+            stiffness = (1.0 + self.spread * part) ** 2
+            try:
+                model = made(scaled(self.model.arm, stiffness=stiffness), self.model.origin[1])
+                more = 0.0, self._phase, self.count
+                yield Planner(model, self._path, self.start, self.limit, *more)
+            except ModelError:
+                continue
 
     def _refuse_beyond(self, torque):
         """Raise a `DesignError` for a torque, (k, n), beyond the limit."""
