@@ -242,6 +242,36 @@ def rough(r):
     )
 
 
+def test_joints_that_stick_are_looked_at_without_delay_too(rough):
+    more = rough.task.at_once()
+    loops, _ = more.held(rough.found.sampling, 1)
+    stuck = [loop for loop in loops if loop.kind == STICKS]
+    late = [loop for loop in rough.loops if loop.kind == STICKS]
+    assert len(stuck) == 2 * len(late) and len(loops) == len(rough.loops) + len(late)
+    sooner = [loop for loop in stuck if "no delay" in loop.name]
+    assert [loop.fraction for loop in sooner] == [0.5 * loop.fraction for loop in late]
+    assert all(
+        len(a.F) < len(b.F) for a, b in zip(sooner, late, strict=True)
+    )  # no torque under way
+    assert not rough.task.hunts(rough.found)
+    wild = rough.found._replace(K=20.0 * rough.found.K)
+    assert rough.task.hunts(wild) and not more.hunts(wild)  # those loops are held already
+
+
+def test_gains_with_which_joints_hunt_are_searched_for_again(rough, monkeypatch):
+    asked = []
+
+    def hunts(task, found):
+        asked.append(task.uncertainty.at_once)
+        return not task.uncertainty.at_once
+
+    monkeypatch.setattr(design_module.Task, "hunts", hunts)
+    monkeypatch.setattr(further, "FURTHER", ())
+    made = design(rough.task.arm, replace(rough.task.settings, effort=0.1))
+    assert made.uncertainty.at_once and asked[0] is False
+    assert any("sticking" in row.name and "no delay" in row.name for row in made.slowest)
+
+
 def test_loops_are_there_for_an_arm_for_a_margin_or_stick(rough):
     margins = ("no delay", "gain x", "delay ", "modes alone")
     for loop in rough.loops:

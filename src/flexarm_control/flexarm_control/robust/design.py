@@ -510,10 +510,16 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
     if found.decay < SLOW * task.speed:
         task = Task(arm, settings, replace(uncertainty, edges=True), task.short)
         found = task.from_nearby(say.part(OTHERWISE, NEARBY), found)
+    if task.hunts(found):
+        task = task.at_once()
+        found = task.from_nearby(say.part(OTHERWISE, NEARBY), found)
     made = task.design(found)
     if found.decay > 0.0 and task.nominal.n_modes:
-        edged = Task(arm, settings, replace(uncertainty, edges=True), task.short)
+        edged = Task(arm, settings, replace(task.uncertainty, edges=True), task.short)
         other = leaving_less(edged, found, say.part(NEARBY, 1.0), asked)
+        if other is not None and edged.hunts(other):
+            edged = edged.at_once()
+            other = leaving_less(edged, found, say.part(NEARBY, 1.0), asked)
         if other is not None:
             sooner = edged.design(other)
             if not later(sooner.recovery, made.recovery):
@@ -675,6 +681,23 @@ class Task:
             _, x = nearby(others, x, *rest)
             used += others.evaluations
         return self.sets(whole, x, used + whole.evaluations)
+
+    def hunts(self, found):
+        """Whether, without delay, stable gains make a joint hunt that sticks; false if such loops are held already."""
+        rubs = any(joint.friction.coulomb for joint in self.arm.joints)
+        if not rubs or self.uncertainty.at_once or found.decay <= 0.0:
+            return False
+        loops, weights = self.at_once().held(found.sampling, len(found.K))
+        stuck = [k for k, loop in enumerate(loops) if loop.kind == STICKS]
+        search = self.search_of(
+            [loops[k] for k in stuck], [weights[k] for k in stuck], found.sampling
+        )
+        return min(search.decays(search.slowest.scaled(found.K))) <= 0.0
+
+    def at_once(self):
+        """The same task, with loops that stick without delay, too."""
+        more = replace(self.uncertainty, at_once=True)
+        return Task(self.arm, self.settings, more, self.short)
 
     def held(self, sampling, count):
         """Loops in and between the configurations, and the weights of `count` sets of gains in each loop."""

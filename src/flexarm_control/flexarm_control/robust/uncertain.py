@@ -37,6 +37,8 @@ class Uncertainty:
         Additional delay of the torque beyond the stated one, in periods [-].
     edges : bool
         Whether the loops include arms of which only payload or only stiffness differs.
+    at_once : bool
+        Whether loops that stick are there without delay, too.
     """
 
     payload: tuple = (0.7, 1.3)
@@ -45,6 +47,7 @@ class Uncertainty:
     gain: tuple = (0.6, 1.7)
     delay: float = 1.0
     edges: bool = False
+    at_once: bool = False
 
 
 def configurations(arm, seed=0):
@@ -126,6 +129,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
       steep as its smoothing makes it; for larger movements it is less, by the first harmonic. A loop that is stable
       with every fraction of this damper does not hunt.
     - With ``uncertainty.edges``: arms of which only payload or only stiffness differs, with the delay.
+    - With ``uncertainty.at_once``: the arms that stick without the delay, too.
 
     In all loops joint speeds are filtered derivatives, like the observer's (`observer.measured_velocity`). A loop with
     measured speeds differs from these.
@@ -188,20 +192,24 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
                 out.append(sampled_loop(nominal, own, q, samples, 1.0, name, UNLIKELY, kind=MARGIN))
     if sticking and any(joint.friction.coulomb for joint in arm.joints):
         out += _sticking(nominal, plants, at, sampling, first)
+        if uncertainty.at_once:
+            out += _sticking(nominal, plants, at, at_once, first, ", no delay", UNLIKELY)
     return out
 
 
-def _sticking(nominal, plants, at, sampling, first):
-    """Loops of the named `plants` that stick: for small movements their Coulomb friction is a damper."""
+def _sticking(nominal, plants, at, sampling, first, more="", likely=1.0):
+    """Loops of the named `plants` that stick: for small movements their Coulomb friction is a damper.
+
+    `more` is added to their names; `likely` is a factor of the decay that is asked of them.
+    """
     out = []
     for i, q in enumerate(at, first):
         for name, plant in plants.items():
             for part, fraction in STICKING.items():
-                words = f"sticking, {part:g} of its friction, {name}, at configuration {i}"
+                words = f"sticking, {part:g} of its friction, {name}{more}, at configuration {i}"
                 if rests(plant, q):
-                    out.append(
-                        sampled_loop(nominal, plant, q, sampling, 1.0, words, fraction, part)
-                    )
+                    asked = likely * fraction
+                    out.append(sampled_loop(nominal, plant, q, sampling, 1.0, words, asked, part))
     return out
 
 
