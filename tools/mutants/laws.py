@@ -315,8 +315,8 @@ ERRORS = [
         (
             "planner",
             "modes that no torque reaches: brought to rest at the model's frequency, like the others",
-            "self.driven = coupling > UNDRIVEN * coupling.max(initial=0.0)",
-            "self.driven = coupling >= 0.0",
+            "self.driven = coupling[:slow] > UNDRIVEN * coupling.max(initial=0.0)",
+            "self.driven = coupling[:slow] >= 0.0",
         ),
         (
             "planner",

@@ -42,7 +42,7 @@ ERRORS = [
         (
             "design",
             "low passes that end the reach: taken however much motions leave behind",
-            "found.decay > 0.0 and leaves(short, other) > leaves(task, found)",
+            "compared and leaves(short, other) > leaves(task, found)",
             "False",
         ),
         (

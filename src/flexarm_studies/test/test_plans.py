@@ -249,6 +249,43 @@ def test_a_plan_that_is_not_found_with_such_modes_is_made_without_them(monkeypat
     assert_allclose(plan.torque, plan_of(89, 0.0).torque)
 
 
+def test_arms_with_other_frequencies_carry_the_same_payload():
+    case = generator.arm(89)
+    known = model.build(case.read().known)
+    motion = scenario.trajectory_of(case.motion, known, np.zeros(1))
+    start = np.stack([motion.positions[0], np.zeros(1), np.zeros(1)])
+    heavier = known.fuller(3, finite_slope=True).with_payload(1.3)
+    ours = Planner(heavier, path_of(motion, start), start, case.read().torque_limits, 0.15)
+    ours.solve()
+    ratios = [other.planned / ours.planned for other in ours._others]
+    assert_allclose(np.mean(ratios, axis=1), [0.85, 0.925, 1.075, 1.15], rtol=0.01)
+
+
+@pytest.mark.parametrize("at_end", [True, False])
+def test_a_softer_arm_that_does_not_rest_at_either_end_is_left_out(at_end, monkeypatch):
+    (ours, _), soft, make = planners(89, 0.15), [], planner.made
+
+    def made(arm, payload):
+        other = make(arm, payload)
+        if not soft:
+            soft.append(other)
+            rest, q_end = other.static_deflection, ours.reference[-1, 0]
+
+            def folds(q):
+                if np.allclose(q, q_end if at_end else ours.start[0]):
+                    raise ModelError("folds under its own weight")
+                return rest(q)
+
+            other.static_deflection = folds
+        return other
+
+    monkeypatch.setattr(planner, "made", made)
+    others = list(ours._alike())
+    assert len(others) == 3 and all(other.model is not soft[0] for other in others)
+    soft.clear()
+    assert np.isfinite(ours.solve().torque).all()
+
+
 def test_arms_that_do_not_rest_if_they_are_softer_are_left_out(monkeypatch):
     def folds(arm, scale):
         raise ModelError("folds under its own weight")

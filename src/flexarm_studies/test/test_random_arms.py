@@ -348,6 +348,11 @@ def test_what_is_wanted_of_designs_is_counted():
     lost = row(0, "designed", None, variant="payload x0.7", decay=0.3, lost="joint1 is 9 rad off")
     (cells,) = report.beaten([lost, row(0, "pid_zvd", 2.0, variant="payload x0.7")])
     assert cells[3] == "lost" and report.BEATEN in report.text(rows, 0)
+    # A baseline that never settles is better than an arm that is lost, and no better than one that never settles.
+    never = row(0, "pid_zvd", None, variant="payload x0.7")
+    assert len(list(report.beaten([lost, never]))) == 1
+    late = row(0, "designed", None, variant="payload x0.7", decay=0.3)
+    assert not list(report.beaten([late, never]))
 
 
 def test_a_share_of_less_than_all_is_not_100_percent():

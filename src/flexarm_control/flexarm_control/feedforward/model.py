@@ -163,7 +163,7 @@ class Preparation:
     start: np.ndarray  # state of the reference that it begins from, (3, n)
     gains: Gains | None
     at_rest: Gains | None = None  # of the arm at rest on the path, for a stop on the way
-    plan: object = None  # a `preview.Plan`
+    plan: object = None  # a `planner.Plan`
     trajectory_id: int = 0  # 0 until it is accepted
     note: str = ""  # what is missing, and why
     left: tuple = ()  # parts that are still to come

@@ -73,12 +73,13 @@ STABLE, STABLER = 1.5, 0.75
 #: Grid steps per period of the fastest mode that is brought to rest.
 STEPS_PER_PERIOD = 40.0
 #: A mode is not brought to rest if the force on it is less than this fraction of that on others [-]: the force of the
-#: joints' acceleration at the end, or the force of the shift.
+#: joints' acceleration at the end (the first number), or the force of the shift (the second). If the shift's force is
+#: also less than the first number, the mode is not looked at.
 UNDRIVEN, UNMOVED = 1e-6, 1e-2
 #: Smallest force that counts as one.
 TINY = 1e-300
-#: What is left of such modes is made small at these fractions of the spread of frequencies [-], and with this weight on
-#: the amplitude of the tip over the reach, relative to the shift: rho [rad].
+#: What is left of modes that are not brought to rest is made small at these fractions of the spread of frequencies [-],
+#: and with this weight on the amplitude of the tip over the reach, relative to the shift: rho [rad].
 SPREADS, QUIET = (-1.0, -0.5, 0.5, 1.0), 100.0
 #: The plan's step is at most this fraction of the step of `STEPS_PER_PERIOD`, or one step of the integration [-].
 PLANNED = 0.25
@@ -200,8 +201,8 @@ class Planner:
         self.modal = shapes[:, :slow].T @ at_end.M[n:, n:] if m else np.zeros((0, 0))
         shown = [self._shown(end[0], shapes[:, i]) for i in range(slow)] if m else []
         self.shown = np.array(shown) / model.arm.reach
-        coupling = np.abs(shapes[:, :slow].T @ at_end.M[n:, :n]).max(axis=1) if m else np.zeros(0)
-        self.driven = coupling > UNDRIVEN * coupling.max(initial=0.0)
+        coupling = np.abs(shapes.T @ at_end.M[n:, :n]).max(axis=1) if m else np.zeros(0)
+        self.driven = coupling[:slow] > UNDRIVEN * coupling.max(initial=0.0)
         step = min(2.0 * np.pi / omega[max(slow, 1) - 1] / STEPS_PER_PERIOD, 0.01)
         self.steps = int(np.ceil(self.duration / min(step, phase / omega[-1])))
         # The plan has fewer steps than the integration if a faster mode that is not planned needs short ones.
@@ -416,7 +417,8 @@ class Planner:
         if not self.spread or not self.excited.any():
             return rows, values
         if self._others is None:
-            self._others = list(self._alike())
+            self._others = []
+            self._others += self._alike()
         ends = [(self, x[-1], v[-1])]
         for other in self._others:
             other._along(c)
@@ -433,14 +435,19 @@ class Planner:
         return rows, values
 
     def _alike(self):
-        """Planners for arms with other frequencies, with the same shifts; softer ones may not rest at the end."""
+        """Planners for arms with other frequencies, with the same shifts.
+
+        Softer arms that do not rest at an end are left out, and stiffer ones that need too many steps.
+        """
+        arm, payload = self.model.origin
         for part in SPREADS:
             stiffness = (1.0 + self.spread * part) ** 2
             try:
-                model = made(scaled(self.model.arm, stiffness=stiffness), self.model.origin[1])
+                model = made(scaled(arm, stiffness=stiffness), payload)
+                model.static_deflection(self.start[0])
                 more = 0.0, self._phase, self.count
                 yield Planner(model, self._path, self.start, self.limit, *more)
-            except ModelError:
+            except (DesignError, ModelError):
                 continue
 
     def _refuse_beyond(self, torque):
@@ -504,7 +511,14 @@ def _penalised(H, right, A, b, rows, values, x):
         active |= beyond
         R = rows[active]
         P = _least(H, R.T, A, np.zeros((len(b), len(R))))
-        half = np.linalg.cholesky(R @ P + np.eye(len(R)) / PENALTY)
-        wanted = np.linalg.solve(half, R @ free - values[active])
-        x = free - P @ nnls(half.T, wanted)[0]
+        try:
+            half = np.linalg.cholesky(R @ P + np.eye(len(R)) / PENALTY)
+            wanted = np.linalg.solve(half, R @ free - values[active])
+            x = free - P @ nnls(half.T, wanted)[0]
+        except (np.linalg.LinAlgError, RuntimeError) as error:
+            raise DesignError(
+                f"no plan within the torque limits is found ({error})",
+                field="preview",
+                hint="give the motion more time",
+            ) from None
     return x

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""Feed-forward with preview: follows a motion that bends the arm and leaves it at rest at its end.
 
-A trajectory is known as a whole when it is received, and the joints need not follow it exactly. The module `planner`
-computes a motion of the whole arm near it, when it is received, off the control path. `model` follows the motion in
-place of the slow manifold: the regulator of its simulated arm removes the remaining error.
+A trajectory is known as a whole when it is received, and the joints need not follow it exactly. At that time the module
+`planner` computes, off the control path, a motion of the whole arm whose joints stay near the trajectory. `model`
+follows this motion in place of the slow manifold: the regulator of its simulated arm removes the remaining error.
 
 If no shift is found within the torque limit, and the feed-forward knows more of the arm than the control, the plan of
 the control's own model is taken. If that has none either, the motion that `model` makes with that model is taken. If

@@ -503,16 +503,19 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
         if max(found.decay, reached) < (LEAST if short.low_passes else LITTLE):
             found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
         # Modes beyond the corner may ring long after a motion, although the decay that is asked of others is larger.
+        compared = found.decay > 0.0 and task.nominal.n_modes
         if reached > max(WORTH * found.decay, 0.0) and not (
-            found.decay > 0.0 and leaves(short, other) > leaves(task, found)
+            compared and leaves(short, other) > leaves(task, found)
         ):
             task, found = short, other
     if found.decay < SLOW * task.speed:
         task = Task(arm, settings, replace(uncertainty, edges=True), task.short)
         found = task.from_nearby(say.part(OTHERWISE, NEARBY), found)
     if task.hunts(found):
-        task = task.at_once()
-        found = task.from_nearby(say.part(OTHERWISE, NEARBY), found)
+        more = task.at_once()
+        other = more.from_nearby(say.part(OTHERWISE, NEARBY), found)
+        if other.decay > 0.0:
+            task, found = more, other
     made = task.design(found)
     if found.decay > 0.0 and task.nominal.n_modes:
         edged = Task(arm, settings, replace(task.uncertainty, edges=True), task.short)
@@ -683,7 +686,10 @@ class Task:
         return self.sets(whole, x, used + whole.evaluations)
 
     def hunts(self, found):
-        """Whether, without delay, stable gains make a joint hunt that sticks; false if such loops are held already."""
+        """Whether a sticking joint would hunt if the torque had no delay.
+
+        False if the task has such loops, or if the gains are unstable.
+        """
         rubs = any(joint.friction.coulomb for joint in self.arm.joints)
         if not rubs or self.uncertainty.at_once or found.decay <= 0.0:
             return False

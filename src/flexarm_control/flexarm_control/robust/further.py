@@ -56,8 +56,8 @@ def leaving_less(task, found, progress, speed=None):
     decays = whole.decays(x)
     if not left or min(decays) <= 0.0:
         return None
-    leaves, speed = after(x)[0], speed or task.speed
-    chosen = next((one for one in FURTHER if leaves >= one.much / speed), None)
+    left_now, speed = after(x)[0], speed or task.speed
+    chosen = next((one for one in FURTHER if left_now >= one.much / speed), None)
     if chosen is None:
         return None
     eased = [

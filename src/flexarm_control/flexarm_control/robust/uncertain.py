@@ -38,7 +38,7 @@ class Uncertainty:
     edges : bool
         Whether the loops include arms of which only payload or only stiffness differs.
     at_once : bool
-        Whether loops that stick are there without delay, too.
+        Whether the loops of joints that stick are also there without the delay.
     """
 
     payload: tuple = (0.7, 1.3)
@@ -129,7 +129,7 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
       steep as its smoothing makes it; for larger movements it is less, by the first harmonic. A loop that is stable
       with every fraction of this damper does not hunt.
     - With ``uncertainty.edges``: arms of which only payload or only stiffness differs, with the delay.
-    - With ``uncertainty.at_once``: the arms that stick without the delay, too.
+    - With ``uncertainty.at_once``: the loops of the arms that stick, also without the delay.
 
     In all loops joint speeds are filtered derivatives, like the observer's (`observer.measured_velocity`). A loop with
     measured speeds differs from these.

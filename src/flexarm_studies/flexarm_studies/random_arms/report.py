@@ -184,27 +184,25 @@ def loud(rows, seed):
 def beaten(rows):
     """Cells of the columns `BETTER`, for each run of a design in `rows` that the best baseline beats."""
     best, smallest = best_baseline(rows), _smallest_residual(rows)
+    designed = {row["controller"] for row in rows if "decay" in row}
     for row in rows:
         place = row["number"], row["variant"]
-        if "decay" not in row or row["variant"] not in UNSURE or place not in best:
+        if row["controller"] not in designed or row["variant"] not in UNSURE or place not in best:
             continue
         if not _no_worse(row, best, smallest):
-            after = f"{row['settling_s']:.3g}" if row.get("settled") else _unsettled(row)
+            never = "never" if outcome(row) == "works" else outcome(row)
+            after = f"{row['settling_s']:.3g}" if row.get("settled") else never
             sooner = f"{best[place]:.3g}" if np.isfinite(best[place]) else "never"
             residuals = row.get("residual_tip"), smallest.get(place)
             words = (None if size is None else f"{size:.1e}" for size in residuals)
             yield row["arm"], row["variant"], row["controller"], after, sooner, *words
 
 
-def _unsettled(row):
-    return "never" if outcome(row) == "works" else outcome(row)
-
-
 def _no_worse(row, best, smallest):
     """Whether a run settles no later and leaves no more than `best_baseline` and its `_smallest_residual`."""
     place = row["number"], row["variant"]
     if not row.get("settled"):
-        return not np.isfinite(best[place])
+        return outcome(row) == "works" and not np.isfinite(best[place])
     sooner = row["settling_s"] <= best[place] + EQUAL
     return sooner and row["residual_tip"] <= max(smallest.get(place, np.inf), STILL)
 
@@ -218,7 +216,7 @@ def _quiet(row):
 def _in_words(row):
     if outcome(row) != "works":
         return outcome(row)
-    settled = f"{_periods(row):.2g}" if row["settled"] else _unsettled(row)
+    settled = f"{_periods(row):.2g}" if row["settled"] else "never"
     return settled if row["at_rest"] else f"{settled} ({row['rest_joint_deg']:.2g}°)"
 
 
