@@ -176,8 +176,8 @@ ERRORS = [
         (
             "further",
             "after a motion: every design goes on",
-            "if leaves >= one.much / speed",
-            "if leaves >= 0.0",
+            "if left_now >= one.much / speed",
+            "if left_now >= 0.0",
         ),
         (
             "further",

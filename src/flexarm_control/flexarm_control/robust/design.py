@@ -688,7 +688,7 @@ class Task:
     def hunts(self, found):
         """Whether a sticking joint would hunt if the torque had no delay.
 
-        False if the task has such loops, or if the gains are unstable.
+        False if the task has such loops, or if the `found` gains are unstable.
         """
         rubs = any(joint.friction.coulomb for joint in self.arm.joints)
         if not rubs or self.uncertainty.at_once or found.decay <= 0.0:
