@@ -297,3 +297,15 @@ def test_compare_judges_on_uncertain_plants_and_goes_on(tmp_path, monkeypatch, c
     monkeypatch.setattr(command, "on_plants", None)  # not called again
     command.main(words)
     assert capsys.readouterr().out == text
+
+
+def test_the_numbers_of_a_row_have_six_digits(monkeypatch):
+    monkeypatch.setattr(
+        runs.trial,
+        "run",
+        lambda *_, **__: {"settling_s": 0.123456789, "settled": True, "rest": None},
+    )
+    make = lambda case: SimpleNamespace(found={"decay": 12345.6789})  # noqa: E731
+    (row,) = runs.rows(SimpleNamespace(name="arm"), 3, "own", make, ["exact"])
+    assert (row["settling_s"], row["decay"]) == (0.123457, 12345.7)
+    assert row["settled"] is True and row["rest"] is None and row["sample"] == "3/own/exact"

@@ -16,9 +16,7 @@ class Settings:
     period: float  # of the samples [s]
     configuration: np.ndarray  # of the joints, (n,) [rad]
     known: object = None  # the control's own `ArmModel`, if the feed-forward's model has more
-    spread: float = (
-        0.0  # relative error of the frequencies of modes that the joints hardly move [-]
-    )
+    spread: float = 0.0  # relative error of frequencies, of modes that the joints hardly move [-]
 
 
 class Feedforward(Component, ABC):

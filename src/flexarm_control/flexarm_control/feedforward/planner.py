@@ -388,9 +388,8 @@ class Planner:
             self._take_end(forced[-1])
         moved = np.tile(self.moved, 2)
         A, b = self.bends[moved], -self._left(x[-1], v[-1])[moved]
-        scale = 1.0 / np.abs(A).max(
-            axis=1
-        )  # all rows are scaled alike, since deflections are thousandths
+        # All rows are scaled alike, since deflections are thousandths.
+        scale = 1.0 / np.abs(A).max(axis=1)
         A, b = A * scale[:, None], b * scale
         _, u = finite(*self._forces(at, x, v))
         return self._within_limits(c, A, b, self._quiet(c, x, v, knots), u, self.torque_by)
@@ -470,9 +469,8 @@ class Planner:
         n, count = c.shape
         N, Ndd = self.basis[0], self.basis[2] / self.omega**2
         weight = (N.T @ N + SMOOTHNESS * Ndd.T @ Ndd) / len(N)
-        unit = np.abs(
-            weight
-        ).max()  # for the penalty, whatever the number of times and coefficients
+        # The penalty weighs the same whatever the number of times and coefficients.
+        unit = np.abs(weight).max()
         H = np.kron(np.eye(n), weight / unit)
         right = -H @ c.ravel()
         rows, values = (part / np.sqrt(unit) for part in quiet)

@@ -701,7 +701,7 @@ class Task:
         return min(search.decays(search.slowest.scaled(found.K))) <= 0.0
 
     def at_once(self):
-        """The same task, with loops that stick without delay, too."""
+        """The same task; the loops of joints that stick are there without the delay as well."""
         more = replace(self.uncertainty, at_once=True)
         return Task(self.arm, self.settings, more, self.short)
 
