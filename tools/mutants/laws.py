@@ -172,6 +172,18 @@ ERRORS = [
         "composite",
         TESTS + "test_composite.py",
         (
+            "seen",
+            "a motion that is put elsewhere: seen from before",
+            "np.inf if motion.placed or dt <= 0.0 else dt",
+            "np.inf if dt <= 0.0 else dt",
+        ),
+        (
+            "seen",
+            "another control of the same motion: remembers nothing",
+            "self._states[:], self._intervals[:] = other._states, other._intervals",
+            "pass",
+        ),
+        (
             "law",
             "a law that is replaced: not faded",
             "fading.jump(old)",
@@ -294,6 +306,12 @@ ERRORS = [
         "flexarm_control",
         "feedforward",
         PLANS,
+        (
+            "planner",
+            "torque left to the feedback: a twentieth",
+            "self.share - np.append(here, -here)",
+            "0.95 - np.append(here, -here)",
+        ),
         (
             "planner",
             "a plan that does not converge has no more derivatives",

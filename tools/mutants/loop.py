@@ -24,6 +24,28 @@ ERRORS = [
     *of(
         "flexarm_control",
         "loop",
+        "flexarm_studies/test/test_simulate_controller.py -k late_torque",
+        (
+            "arm_controller",
+            "the measured delay: not given to the law",
+            "self.law.take_delay(self.torque_delay.delay)",
+            "pass",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "composite",
+        "flexarm_studies/test/test_simulate_controller.py -k late_torque",
+        (
+            "law",
+            "a late torque: the feed-forward is not ahead of the reference",
+            "self._lead_ns = round(self._seen.late * SECOND)",
+            "self._lead_ns = 0",
+        ),
+    ),
+    *of(
+        "flexarm_control",
+        "loop",
         TESTS + "test_torque_delay.py",
         ("torque_delay", "whole periods only", "float((k + f[k])", "float((k + 0.0 * f[k])"),
         (

@@ -293,6 +293,72 @@ def test_a_motion_that_is_put_elsewhere_makes_no_speed():
     assert np.abs(seen.velocity - before).max() < 0.01
 
 
+def seen_late(late, corners=(0.0, 0.0), count=100, step=1e-2, gone=()):
+    """Rows (time, position, amplitude, velocity, rate) of a motion that is seen so late; samples `gone` are lost."""
+    motion, rows, last = Swinging(), [], None
+    seen = SeenMotion(motion, *corners, 0.1)
+    seen.be_late(late)
+    for k in range(count):
+        if k in gone:
+            continue
+        motion.at(step * k)
+        seen.update(0.0 if last is None else step * (k - last))
+        last = k
+        parts = seen.position, seen.amplitude, seen.velocity, seen.rate
+        rows.append(np.concatenate([[step * k], *parts]))
+    return np.array(rows)
+
+
+def test_the_motion_is_seen_as_late_as_the_torque_acts():
+    for corners in (0.0, 0.0), (150.0, 220.0):
+        there, late = (seen_late(d, corners) for d in (0.0, 0.03))
+        assert_allclose(late[-1, 1:], there[-4, 1:], atol=1e-8)
+    there = seen_late(0.0)
+    between = seen_late(0.034)
+    wanted = 0.6 * there[-4] + 0.4 * there[-5]
+    assert_allclose(between[-1, 1:4], wanted[1:4], atol=1e-8)  # positions, linear between samples
+    gaps = seen_late(0.03, gone=(93, 94, 97))
+    assert_allclose(gaps[-1, 1:4], there[-4, 1:4], atol=1e-8)
+
+
+def test_a_motion_is_seen_no_later_than_it_is_remembered_and_as_before_where_nothing_is_known():
+    seen = SeenMotion(Swinging(), 0.0, 0.0, 0.02)
+    for delay, late in ((np.nan, 0.0), (0.01, 0.01), (np.nan, 0.01), (0.5, 0.02), (0.0, 0.0)):
+        seen.be_late(delay)
+        assert seen.late == late
+
+
+def test_of_a_motion_that_begins_or_is_put_elsewhere_nothing_earlier_is_seen():
+    motion = Swinging()
+    seen = SeenMotion(motion, 0.0, 0.0, 0.1)
+    seen.be_late(0.02)
+    for k in range(60):
+        motion.at(1e-2 * k)
+        motion.placed = k == 40
+        seen.update(0.0 if k == 0 else 1e-2)
+        if k == 50:
+            seen.update(0.0)  # a new session
+        if k in (0, 40, 50):
+            assert seen.position == motion.position
+        elif k > 2 and k not in (41, 51):
+            assert abs(seen.position - np.sin(3e-2 * (k - 2))) < 1e-9
+
+
+def test_what_is_remembered_of_a_motion_goes_over_to_another_control():
+    one, other = (SeenMotion(Swinging(), 150.0, 220.0, 0.1) for _ in range(2))
+    one.be_late(0.02)
+    for k in range(60):
+        one._motion.at(1e-2 * k)
+        one.update(1e-2 * (k > 0))
+    other.take(one)
+    for part in one, other:
+        part._motion.at(0.6)
+        part.update(1e-2)
+    for name in ("position", "amplitude", "velocity", "rate", "late"):
+        assert_array_equal(getattr(one, name), getattr(other, name))
+    assert one.late == 0.02
+
+
 def test_without_corners_the_motion_is_seen_as_it_is():
     motion, seen = swung(0.0, 100.0, step=1e-2, count=5)
     assert_array_equal(seen.velocity, motion.velocity)

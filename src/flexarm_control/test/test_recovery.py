@@ -129,7 +129,7 @@ def test_without_limits_it_is_what_the_motion_leaves(r, monkeypatch):
     one = residuals(r.model, np.zeros(1), r.design.sampling, UNCERTAIN)[1]
     period = 2.0 * np.pi / r.model.frequencies(np.zeros(1), locked=True)[0]
     motion = settling.Motion(build(richer(r.model.arm.whole)), np.zeros(1), period, 0.002)
-    found = of(r, torque=np.abs(motion.torque).max() / recovery_module.SHARE, velocity=np.inf)
+    found = of(r, torque=np.abs(motion.torque).max() / UNCERTAIN.torque_share, velocity=np.inf)
     assert 0.0 < found.unlimited == pytest.approx(one.settling(r.design.K), abs=1e-9)
 
 
@@ -160,7 +160,7 @@ def test_two_joints_move_together_with_the_gains_of_their_configuration(monkeypa
         way = (at[1] - at[0]) / np.linalg.norm(at[1] - at[0]) * (-1.0) ** (k // 2)
         free = one._moved(sets[here])[1].transpose(0, 2, 1) @ way
         part = forces[0, 0] / (one._forces[0].T @ way)[0]
-        assert np.isinf(limit[0]) or np.abs(torque / limit).max() <= recovery_module.SHARE + 1e-9
+        assert np.isinf(limit[0]) or np.abs(torque / limit).max() <= UNCERTAIN.torque_share + 1e-9
         assert_allclose(held, static_torque(build(richer(arm.whole)), at[here]), atol=1e-12)
         if np.isinf(limit[0]):
             rows = 400
@@ -171,12 +171,20 @@ def test_two_joints_move_together_with_the_gains_of_their_configuration(monkeypa
 
 def test_limits_count_where_the_torque_reaches_them(r, monkeypatch):
     """A third of the torque is enough for the motion; 1.3 times all of it is not."""
-    monkeypatch.setattr(recovery_module, "SHARE", 0.3)
+    monkeypatch.setattr(Uncertainty, "torque_share", 0.3)
     third = of(r, velocity=np.inf)
     assert third.limited == third.unlimited and third.later == 0.0
-    monkeypatch.setattr(recovery_module, "SHARE", 1.3)
+    monkeypatch.setattr(Uncertainty, "torque_share", 1.3)
     more = of(r, velocity=np.inf)
     assert more.later == more.limited - more.unlimited > 0.1
+
+
+@pytest.mark.parametrize(
+    ("payload", "share"),
+    [((0.7, 1.3), 0.75), ((0.9, 1.1), 0.886), ((0.5, 1.0), 0.95), ((1.0, 5.0), 0.5)],
+)
+def test_a_motion_leaves_the_torque_that_a_heavier_payload_needs(payload, share):
+    assert Uncertainty(payload=payload).torque_share == share
 
 
 def test_a_motion_is_not_faster_than_a_joint_may_turn():

@@ -499,8 +499,11 @@ def test_each_speed_gets_the_decay_that_it_asks_at_the_noise_that_it_allows(monk
 
 def test_its_parameters_make_the_control(designed):
     model = build(designed.arm)
-    law = control(model, {k: v for k, v in designed.parameters().items()})
+    values = designed.parameters()
+    law = control(model, values)
     K, n = designed.K, 1
+    assert values["motion_delay"] == designed.settings.delay
+    assert law.feedforward.settings.share == values["feedforward_torque"] == 0.75
     assert_allclose(law.slow.stiffness, K[0, 0], rtol=1e-5)
     assert_allclose(law.slow.gain, K[0, 2], rtol=1e-5)
     assert_allclose(law.fast.K_f, -K[:, 3 * n :], rtol=1e-5)

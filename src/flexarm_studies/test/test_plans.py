@@ -28,15 +28,18 @@ def reference_manifold(known):
     ).manifold
 
 
-def prepared(number, kind, torque=1.0):
-    """The arm's model, its motion's path, and what a feed-forward makes of it with a part of the torque limits."""
+def prepared(number, kind, torque=1.0, share=base.SHARE):
+    """The arm's model, its motion's path, and what a feed-forward makes of it with a part of the torque limits.
+
+    Of these, a plan takes the `share`.
+    """
     case = generator.arm(number)
     known = model.build(case.read().known)
     n = known.n_joints
     motion = scenario.trajectory_of(case.motion, known, np.zeros(n))
     start = np.zeros((3, n))
     start[0] = motion.positions[0]
-    settings = base.Settings(2e-3, start[0])
+    settings = base.Settings(2e-3, start[0], share=share)
     forward = kind(known, reference_manifold(known), settings)
     forward.limit = torque * known.arm.torque_limits
     found = forward.prepare(motion, start)
@@ -74,7 +77,7 @@ def test_a_motion_that_torque_allows_no_preview_of_is_regulated_all_the_same():
 def test_a_plan_has_half_of_the_torque_to_use():
     known, _, found = prepared(10, Preview, torque=0.5)
     share = np.abs(found.plan.torque) / (0.5 * known.arm.torque_limits)
-    assert share.max() <= 1.0 and share.max(axis=0).min() > 0.94
+    assert share.max() <= 1.0 and share.max(axis=0).min() > 0.74
 
 
 @pytest.mark.long
@@ -155,10 +158,12 @@ def test_a_mode_across_the_joint_is_not_planned_where_slopes_are_finite():
     assert (np.abs(plan.torque) < 0.8 * known.arm.torque_limits).all()
 
 
-def test_a_plan_that_torque_binds_is_smooth_and_leaves_some_to_the_feedback():
-    known, _, found = prepared(10, Preview)
+@pytest.mark.parametrize("share", [base.SHARE, 0.9])
+def test_a_plan_that_torque_binds_is_smooth_and_leaves_some_to_the_feedback(share):
+    known, _, found = prepared(10, Preview, share=share)
     torque, limits = np.abs(found.plan.torque), known.arm.torque_limits
-    assert (torque < 0.96 * limits).all() and (torque.max(axis=0) > 0.94 * limits).any()
+    assert (torque < (share + 0.01) * limits).all()
+    assert (torque.max(axis=0) > (share - 0.01) * limits).any()
 
 
 def test_the_compiled_bending_of_a_plan_is_that_of_the_equations():
@@ -227,7 +232,7 @@ def test_a_plan_leaves_little_in_a_mode_that_no_torque_reaches(number, payload, 
 def test_a_mode_that_no_torque_reaches_is_left_where_the_torque_does_not_suffice():
     (ours, real), (plain, _) = planners(89, 0.15), planners(89, 0.0)
     for part in ours, plain:
-        part.limit = 0.69 * part.limit  # the plain plan takes 0.68
+        part.limit, part.share = 0.69 * part.limit, 0.95  # the plain plan takes 0.68
     assert left_across(plain.solve(), real) < 1e-3
     assert left_across(ours.solve(), real) < 1e-3
 

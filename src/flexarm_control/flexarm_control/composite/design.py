@@ -8,7 +8,7 @@ from flexarm_dynamics.models.levels import FINITE_SLOPE, LEVELS
 from flexarm_dynamics.parameters import check_all, parameter
 
 from ..component import make
-from ..feedforward.base import Settings
+from ..feedforward.base import SHARE, Settings
 from . import full_order
 from .law import CompositeControl
 from .seen import shown
@@ -39,6 +39,10 @@ PARAMETERS = (
         " planned motion excites them little even if their frequencies differ from the model's by up to this fraction;"
         " 0.0: they are left as they are."
     ),
+    parameter("feedforward_torque", SHARE, "-", 0.1, 1.0).described(
+        "With preview: a planned motion takes no more than about this fraction of the torque limits, if it can. The"
+        " rest is left to the feedback, for what the model does not know, such as a heavier payload."
+    ),
     parameter("motion_velocity_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
         "Corner of the observer's filter of joint speeds (observer.joint_velocity_bandwidth, if"
         " observer.measured_velocity is false). The speeds of the feed-forward's motion pass the same filter, so that"
@@ -47,6 +51,11 @@ PARAMETERS = (
     parameter("motion_rate_bandwidth", 0.0, "rad/s", 0.0, 1e6).described(
         "The same for the rates of deflections, if the observer filters them (observer.bandwidth of"
         " filtered_derivative); 0.0: no filter."
+    ),
+    parameter("motion_delay", 0.0, "s", 0.0, 0.1).described(
+        "Longest delay of the torque that is taken into account: the arm follows the feed-forward's motion as late as"
+        " its torque acts, and the laws see the motion that late. The controller measures the delay; 0.0: the laws see"
+        " the motion without delay."
     ),
     parameter("saturation", "each", choices=("each", "together")).described(
         "Effect of the torque limit on the feedback about a feed-forward. each: every joint is clipped by itself;"
@@ -113,15 +122,22 @@ def design(model, slow, fast, manifold=None, settings=None):
     full_order.check(control, q, chosen["rate"], chosen["stability_margin"])
     if kind is None or slow_law.learns:
         return control
-    seen = chosen["motion_velocity_bandwidth"], chosen["motion_rate_bandwidth"]
+    seen = {
+        "joint_corner": chosen["motion_velocity_bandwidth"],
+        "rate_corner": chosen["motion_rate_bandwidth"],
+        "longest": chosen["motion_delay"],
+    }
     level = chosen["feedforward_level"]
     modes = model.fuller(chosen["feedforward_modes"])
     fuller = modes.fuller(0, level != "file", level == FINITE_SLOPE)
     if modes is not model:
-        seen += (shown(model, fuller),)
+        seen["shown"] = shown(model, fuller)
+    elif not any(seen.values()):
+        seen = None
     # The manifold keeps the file's kinematics: the regulator of the fuller arm follows it and removes the difference.
     known = None if fuller is model else model
-    planning = Settings(1.0 / chosen["rate"], q, known, chosen["feedforward_spread"])
+    shared = chosen["feedforward_spread"], chosen["feedforward_torque"]
+    planning = Settings(1.0 / chosen["rate"], q, known, *shared)
     motion = kind(fuller, surface.of(modes), planning)
     together = chosen["saturation"] == "together"
     return CompositeControl(model, slow_law, fast_law, surface, motion, seen, together)

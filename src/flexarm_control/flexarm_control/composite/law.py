@@ -22,11 +22,16 @@ from ..component import at_rest
 from ..fading import Fading, fading_rate, lowest
 from ..feedforward.model import At
 from ..manifold.quasi_steady import QuasiSteady
+from ..trajectory.path import Path
+from ..trajectory.values import SECOND
 from .seen import SeenMotion
 
 #: Ratio of the rate at which the torque of another payload fades to the lowest locked frequency: a hundredth is left
 #: after two periods.
 PAYLOAD_FADING = 8.4 / (4.0 * np.pi)
+
+#: Weight of the newest measurement in the mean delay of the torque [-].
+NEWEST = 0.2
 
 
 class CompositeControl:
@@ -41,8 +46,8 @@ class CompositeControl:
         If not given, that of the paper, `QuasiSteady`.
     feedforward : Feedforward, optional
         The motion that the arm is held to; if not given, the reference and its manifold.
-    seen : tuple
-        How the observer would show that motion: the further arguments of `SeenMotion`.
+    seen : dict, optional
+        How the observer would show that motion: the further arguments of `SeenMotion`; if not given, as it is.
     together : bool
         Whether a joint at its torque limit scales the feedback of all joints, or is clipped alone; used only with a
         feed-forward.
@@ -60,11 +65,12 @@ class CompositeControl:
     """
 
     def __init__(
-        self, model, slow, fast, manifold=None, feedforward=None, seen=(0.0, 0.0), together=False
+        self, model, slow, fast, manifold=None, feedforward=None, seen=None, together=False
     ):
         self.model, self.slow, self.fast = model, slow, fast
         self.fast_fraction, self._together = 1.0, together
-        self._last = None  # reference and interval of the last step
+        self._last = None  # reference of the feed-forward, and interval, of the last step
+        self._delay, self._lead_ns = np.nan, 0  # of the torque [s], and of that reference [ns]
         n, rate = model.n_joints, fading_rate(model)
         self._limit = np.full(n, np.inf)
         # Jump of the torque from the replaced control, which is `_before` until the first step of this one.
@@ -77,8 +83,7 @@ class CompositeControl:
         self.manifold = QuasiSteady(model, slow, {}) if manifold is None else manifold
         self.feedforward = self._seen = feedforward
         if feedforward is not None:
-            plain = seen == (0.0, 0.0)
-            self._seen = feedforward if plain else SeenMotion(feedforward, *seen)
+            self._seen = feedforward if seen is None else SeenMotion(feedforward, **seen)
             response = self.manifold.error_response(feedforward.settings.configuration)
             self._response, self._bar = np.vstack(response), np.zeros(2 * model.n_modes)
         n, m = model.n_joints, model.n_modes
@@ -96,6 +101,11 @@ class CompositeControl:
         self._limit = value
         if self.feedforward is not None:
             self.feedforward.limit = value
+
+    def take_delay(self, delay):
+        """Take a measured time from a sample until the torque that answers it acts [s]."""
+        known = self._delay
+        self._delay = known + NEWEST * (delay - known) if np.isfinite(known) else delay
 
     def warnings(self):
         """What a user should know about these laws on this arm; each a sentence."""
@@ -116,6 +126,7 @@ class CompositeControl:
         self.limit, self.fast_fraction = other.limit, other.fast_fraction
         self._pieces.take(other._pieces)
         self._source = other._source
+        self._delay, self._lead_ns = other._delay, other._lead_ns
         self._other_payload = other.model.payload_scale != self.model.payload_scale
         if self._other_payload:
             self._exchanged.rate = PAYLOAD_FADING * lowest(self.model)
@@ -208,14 +219,28 @@ class CompositeControl:
 
     def _advance(self, reference, dt):
         """Advance the states of the laws, and the feed-forward's motion, to this sample."""
-        self._last = reference, dt
         if dt > 0.0:
             self.slow.advance(dt)
             self.fast.advance(dt)
-        if self.feedforward is not None:
+        if isinstance(self._seen, SeenMotion):
+            reference = self._led(reference)
             self.feedforward.update(reference, dt)
-            if self._seen is not self.feedforward:
-                self._seen.update(dt)
+            self._seen.update(dt)
+        elif self.feedforward is not None:
+            self.feedforward.update(reference, dt)
+        self._last = reference, dt
+
+    def _led(self, reference):
+        """The reference that the feed-forward follows: so far ahead that the arm, whose torque is late, is on time.
+
+        The delay that has been measured by then is taken while the reference rests, and kept during a motion.
+        """
+        path, stamp_ns = getattr(reference, "path", None), getattr(reference, "stamp_ns", 0)
+        if path is None or path.piece(stamp_ns) == Path.END:
+            self._seen.be_late(self._delay)
+            self._lead_ns = round(self._seen.late * SECOND)
+            return reference
+        return At(path, stamp_ns + self._lead_ns) if self._lead_ns else reference
 
     def _slow_on_manifold(self, q, qd, reference, dt):
         """Slow torque towards the reference, including the manifold's torque, and the manifold's z_bar."""
@@ -264,7 +289,7 @@ class CompositeControl:
             u[:] = self.slow.torque_at(q, qd, motion)
             nominal = self._nominal_torque(motion.position, motion.velocity, motion.acceleration)
         kernels.compiled().about_motion(
-            q, qd, motion.position, seen.velocity, motion.torque, nominal, self._response, seen.amplitude,
+            q, qd, seen.position, seen.velocity, motion.torque, nominal, self._response, seen.amplitude,
             seen.rate, u, self._bar,
         )  # fmt: skip
         return u, self._bar[:m], self._bar[m:]

@@ -10,6 +10,10 @@ As in the observer, the filter acts on the positions at the samples, not on the 
 sample makes light hubs and fast modes swing within the sample. So the mean of the speeds at both ends of the sample is
 not the mean speed. With the mean of both ends, the control pushed an arm off its motion by 5 degrees.
 
+The torque acts some time after the sample that it answers, and the whole arm follows the feed-forward's motion this
+late. A control that compares the arm with the present motion takes speed times delay for an error. So the control sees
+the motion as it was then. The feed-forward is ahead of the reference by as much, and the arm is on time (`law`).
+
 A feed-forward may know more modes than the observer (`feedforward_modes`). The gauges, with their rows R (module
 `flexarm_dynamics.arm.strain_map`), would then show its amplitudes :math:`\delta'` as
 
@@ -21,6 +25,9 @@ import numpy as np
 from flexarm_dynamics.arm.strain_map import StrainMap, reading_rows
 
 from .. import kernels
+
+#: Number of samples of the motion that are remembered: more than the longest delay that is measured.
+REMEMBERED = 40
 
 
 def shown(model, fuller):
@@ -43,6 +50,8 @@ class SeenMotion:
     motion : Feedforward
     joint_corner, rate_corner : float
         Corners of the observer's filters of joint speeds and of rates of deflections [rad/s]; 0.0: not filtered.
+    longest : float
+        The motion is seen at most this late [s]; 0.0: nothing of it is remembered.
     shown : ndarray, shape (m, k), optional
         What the gauges show of the motion's own k modes; if not given, all modes as they are.
 
@@ -52,36 +61,56 @@ class SeenMotion:
         [rad/s]
     amplitude, rate : ndarray, shape (m,)
         [m, rad], [m/s, rad/s]
+    late : float
+        How late the motion is seen [s].
     """
 
-    def __init__(self, motion, joint_corner, rate_corner, shown=None):
-        self._motion, self._corners = motion, (joint_corner, rate_corner)
-        self._shown = np.eye(motion.rate.size) if shown is None else shown
+    def __init__(self, motion, joint_corner=0.0, rate_corner=0.0, longest=0.0, shown=None):
+        self._motion, self._corners, self._longest = motion, (joint_corner, rate_corner), longest
+        n, k = motion.position.size, motion.rate.size
+        self._shown = np.eye(k) if shown is None else shown
         self.velocity, self.amplitude = motion.velocity.copy(), self._shown @ motion.amplitude
         self.rate = np.zeros_like(self.amplitude)
         self._own_rate = self.rate.copy()
         self._last = motion.position.copy(), self.amplitude.copy()
+        self.late = 0.0
+        rows = REMEMBERED if longest else 0
+        self._states, self._intervals = np.zeros((rows, 2 * (n + k))), np.full(rows, np.inf)
+        self._newest, self._state = 0, np.zeros(2 * (n + k))
+        self._parts = np.split(self._state, [n, n + k, 2 * n + k])
 
     @property
     def position(self):
         """Joints of the motion, (n,) [rad]."""
-        return self._motion.position
+        return self._parts[0] if self._longest else self._motion.position
+
+    def be_late(self, delay):
+        """See the motion so late from now on [s], as far as it is remembered; NaN: as late as before."""
+        if delay >= 0.0:
+            self.late = min(delay, self._longest)
 
     def take(self, other):
         """Go on from the state of another `SeenMotion` of the same motion."""
         mine = (*self._last, self.velocity, self.rate)
         for values, its in zip(mine, (*other._last, other.velocity, other.rate), strict=True):
             values[:] = its
+        if self._states.shape == other._states.shape:
+            self.late, self._newest = min(other.late, self._longest), other._newest
+            self._states[:], self._intervals[:] = other._states, other._intervals
+            self._state[:] = other._state
 
     def update(self, dt):
         """Move on to the motion's present sample, `dt` [s] after the last one; 0: the first sample."""
         motion, own_rate = self._motion, self._own_rate
-        np.dot(self._shown, motion.amplitude, out=self.amplitude)
-        np.dot(self._shown, motion.rate, out=own_rate)
-        places, rates = (motion.position, self.amplitude), (self.velocity, self.rate)
-        parts = zip(
-            places, (motion.velocity, own_rate), rates, self._last, self._corners, strict=True
+        position, amplitude, velocity, rate = (
+            self._before(dt)
+            if self._longest
+            else (motion.position, motion.amplitude, motion.velocity, motion.rate)
         )
+        np.dot(self._shown, amplitude, out=self.amplitude)
+        np.dot(self._shown, rate, out=own_rate)
+        places, rates = (position, self.amplitude), (self.velocity, self.rate)
+        parts = zip(places, (velocity, own_rate), rates, self._last, self._corners, strict=True)
         for place, own, rate, last, corner in parts:
             if corner == 0.0 or dt <= 0.0:
                 rate[:], last[:] = own, place
@@ -89,3 +118,15 @@ class SeenMotion:
             if motion.placed:  # a jump of the position is no speed
                 last[:] = place - dt * own
             kernels.compiled().filtered_derivative(place, dt, corner, last, rate)
+
+    def _before(self, dt):
+        """Note the motion's present state; return its parts (q, delta, qd, delta_d) of `late` ago."""
+        motion = self._motion
+        row = self._newest = (self._newest + 1) % REMEMBERED
+        np.concatenate(
+            [motion.position, motion.amplitude, motion.velocity, motion.rate],
+            out=self._states[row],
+        )
+        self._intervals[row] = np.inf if motion.placed or dt <= 0.0 else dt
+        kernels.compiled().state_before(self.late, row, self._intervals, self._states, self._state)
+        return self._parts

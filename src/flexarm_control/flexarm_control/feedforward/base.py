@@ -8,6 +8,9 @@ import numpy as np
 
 from ..component import Component
 
+#: Fraction of the torque limits that a planned motion takes by default [-].
+SHARE = 0.95
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -17,6 +20,7 @@ class Settings:
     configuration: np.ndarray  # of the joints, (n,) [rad]
     known: object = None  # the control's own `ArmModel`, if the feed-forward's model has more
     spread: float = 0.0  # relative error of frequencies, of modes that the joints hardly move [-]
+    share: float = SHARE  # fraction of the torque limits that a planned motion takes [-]
 
 
 class Feedforward(Component, ABC):

@@ -13,11 +13,15 @@ are linear in c to first order. The shift with the least mean square,
     \min_c \frac{1}{T}\int |p|^2 + \epsilon\,|\ddot p|^2/\omega_1^4\,dt + \rho^2\sum_v |r_v|^2 \quad\text{s.t.}\quad
     \delta(T) = \bar\delta,\; \dot\delta(T) = 0,
 
-solves one linear system; :math:`r_v` is explained below. If its torque exceeds the limit, torque beyond 0.95 of the
-limit is penalised. (A linear programme finds the shift with the smallest maximum within the limit. It takes less time,
-but this shift turns steeply from bound to bound and excites modes beside the plan; one random arm was lost with it.)
-The full equations are then integrated along the solution, and the next round removes the bending that remains at the
-end. It uses the same derivatives as long as each change is much smaller than the one before it.
+solves one linear system; :math:`r_v` is explained below. (A linear programme finds the shift with the smallest maximum
+within the torque limit. It takes less time, but this shift turns steeply from bound to bound and excites modes beside
+the plan; one random arm was lost with it.) The full equations are then integrated along the solution, and the next
+round removes the bending that remains at the end. It uses the same derivatives as long as each change is much smaller
+than the one before it.
+
+Torque beyond a fraction of the limit, `Settings.share`, is penalised. The rest is left to the feedback, for what the
+model does not know. An arm with a heavier payload needs more torque. If its joints are at their limits, they fall
+behind, and the feedback no longer damps the links: two random arms were lost when plans took 0.95 of the limits.
 
 Some modes can't be brought to rest in this way, such as the vertical bending of an arm that only yaws: no torque
 reaches them, and no control damps them after the motion. Yet the motion excites them. Where an arm sags, for example,
@@ -42,6 +46,7 @@ from flexarm_dynamics.models.model import made
 
 from .. import kernels
 from ..trajectory.values import SECOND
+from .base import SHARE
 
 #: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
@@ -56,9 +61,9 @@ ROUNDS, CLOSE, SLOW = 8, 1e-7, 0.2
 #: rounds, the change is also still more than `SLOW` of the first one. If the last change was smaller, the regulator
 #: removes the remaining error.
 FOUND, HOPELESS = 0.02, 5
-#: Fraction of the torque limit at which a plan aims where its torque would be higher, weight of the penalty on torque
-#: beyond it, and maximum number of rounds in which further times at which it is beyond are found.
-RESERVED, PENALTY, PENALTIES = 0.95, 1.0, 30
+#: Weight of the penalty on torque beyond the planned fraction of the limit, and maximum number of rounds in which
+#: further times at which it is beyond are found.
+PENALTY, PENALTIES = 1.0, 30
 #: Approximate number of times at which the torque is bounded.
 GRID = 100
 #: Number of times at which the equations are linearised, in the first round and later, and the step of the finite
@@ -134,12 +139,12 @@ def finite(*arrays):
     return arrays
 
 
-def planned(model, path, start, limit, spread=0.0):
+def planned(model, path, start, limit, spread=0.0, share=SHARE):
     """The `Plan` of a `Planner`; it is made again in shorter steps if the motion grows without bound.
 
     Parameters
     ----------
-    model, path, start, limit, spread
+    model, path, start, limit, spread, share
         As for `Planner`.
 
     Raises
@@ -147,11 +152,11 @@ def planned(model, path, start, limit, spread=0.0):
     DesignError
         If no shift of the reference is found within the torque limit.
     """
-    planner = Planner(model, path, start, limit, spread)
+    planner = Planner(model, path, start, limit, spread, share)
     try:
         return planner.solve()
     except Unbounded:
-        finer = Planner(model, path, start, limit, spread, STABLER)
+        finer = Planner(model, path, start, limit, spread, share, STABLER)
         if finer.steps == planner.steps:
             raise
         return finer.solve()
@@ -171,15 +176,19 @@ class Planner:
         Torque limits [N m]; infinite: none.
     spread : float
         Relative error of the frequencies of modes that the joints hardly move [-]; 0: these modes are left as they are.
+    share : float
+        Fraction of the torque limits beyond which torque is penalised [-].
     phase : float
         Largest phase of the fastest mode per step [rad].
     count : int, optional
         Number of intervals between the knots of the shift.
     """
 
-    def __init__(self, model, path, start, limit, spread=0.0, phase=STABLE, count=None):
+    def __init__(
+        self, model, path, start, limit, spread=0.0, share=SHARE, phase=STABLE, count=None
+    ):
         self.model, self.start, self.limit = model, start, limit
-        self.spread, self._path, self._phase = spread, path, phase
+        self.spread, self.share, self._path, self._phase = spread, share, path, phase
         self._others = None  # planners of arms with other frequencies
         self.stepper = model.driven_stepper(METHODS["rk4"])
         n, m = model.n_joints, model.n_modes
@@ -444,7 +453,7 @@ class Planner:
             try:
                 model = made(scaled(arm, stiffness=stiffness), payload)
                 model.static_deflection(self.start[0])
-                more = 0.0, self._phase, self.count
+                more = 0.0, self.share, self._phase, self.count
                 yield Planner(model, self._path, self.start, self.limit, *more)
             except (DesignError, ModelError):
                 continue
@@ -464,7 +473,7 @@ class Planner:
     def _within_limits(self, c, A, b, quiet, u, du):
         """The change x (n, count) with A x = b after which the function of the module is smallest.
 
-        Torque, u + du x, beyond `RESERVED` of the limit is penalised by the square of what is beyond, over the limit.
+        Torque, u + du x, beyond `share` of the limit is penalised by the square of what is beyond, over the limit.
         """
         n, count = c.shape
         N, Ndd = self.basis[0], self.basis[2] / self.omega**2
@@ -480,9 +489,9 @@ class Planner:
         here = (u[:, limited] / limit).ravel()
         by = (du[:, limited] / limit[:, None]).reshape(here.size, n * count)
         change = _least(H, right, A, b)
-        if (np.abs(here + by @ change) <= 1.0).all():
+        if (np.abs(here + by @ change) <= self.share).all():
             return change.reshape(n, count)
-        rows, values = np.vstack([by, -by]), RESERVED - np.append(here, -here)
+        rows, values = np.vstack([by, -by]), self.share - np.append(here, -here)
         return _penalised(H, right, A, b, rows, values, change).reshape(n, count)
 
 

@@ -51,7 +51,8 @@ class Preview(ModelFeedforward):
         none.state_at(0.0), none.torque_at(0.0)
 
     def _plan(self, model, path, start):
-        known, given = self.settings.known, (path, start, self.limit, self.settings.spread)
+        settings = self.settings
+        known, given = settings.known, (path, start, self.limit, settings.spread, settings.share)
         with np.errstate(over="ignore", invalid="ignore"):  # `finite` checks the results
             try:
                 return planned(model, *given)

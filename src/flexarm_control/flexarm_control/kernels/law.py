@@ -241,3 +241,30 @@ def weights_between(q, at, joints, weights):
         total += weights[k]
     for k in range(weights.size):
         weights[k] /= total
+
+
+def state_before(late, newest, intervals, states, out):
+    """Fill `out` (k,) with the state that was newest some time ago, linear between the samples.
+
+    Parameters
+    ----------
+    late : float
+        How long ago [s]; if this is before the oldest sample, that one is taken.
+    newest : int
+        Row of the newest sample in the ring of rows.
+    intervals : ndarray, shape (s,)
+        Time since the previous sample [s]; infinite: the first one.
+    states : ndarray, shape (s, k)
+        State at each sample.
+    out : ndarray, shape (k,)
+        Filled.
+    """
+    size, i, part = intervals.size, newest, 0.0
+    for _ in range(size - 1):
+        if late < intervals[i]:
+            part = late / intervals[i]
+            break
+        late -= intervals[i]
+        i = (i - 1) % size
+    for k in range(out.size):
+        out[k] = (1.0 - part) * states[i, k] + part * states[i - 1, k]

@@ -85,13 +85,13 @@ class TorqueDelay:
         self._size += 1
 
     def judge(self):
-        """Take the delay from a complete block, if it shows one; call once the torque is sent."""
+        """Take the delay from a complete block, and return whether it shows one; call once the torque is sent."""
         if self._size < BLOCK:
-            return
+            return False
         self._size = 0
         first = int(self._at[0, 0])
         if first <= LAGS + 1 or self._now - first + LAGS + 2 > SENT:
-            return
+            return False
         u, r, d = self._u, self._rest, self._change
         np.take(self._sent, (self._at - self._ages) % SENT, axis=0, out=u)
         np.subtract(self._reported, u[:, :-1], out=r)
@@ -101,6 +101,8 @@ class TorqueDelay:
         rest -= f * (2.0 * both - f * change)
         k = int(np.argmin(rest))
         size = np.vdot(self._reported, self._reported)
-        if change[k] > CHANGES**2 * size and rest[k] <= FITS * change[k]:
-            self.delay = float((k + f[k]) * self._period)
-            self.count += 1
+        if not (change[k] > CHANGES**2 * size and rest[k] <= FITS * change[k]):
+            return False
+        self.delay = float((k + f[k]) * self._period)
+        self.count += 1
+        return True

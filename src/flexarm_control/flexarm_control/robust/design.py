@@ -171,7 +171,7 @@ class Design:
     sets : ndarray, shape (k, n, 3n + 2m)
         One set of gains for all configurations, or one for each; see `flexarm_control.schedule`.
     recovery : Recovery or None
-        From motions that take nearly all torque; None: not computed.
+        From motions that take as much torque as a plan; None: not computed.
     slowed : bool
         Whether the speed is lower than requested, because the arm would not come back from its torque limits with
         faster gains.
@@ -273,6 +273,8 @@ class Design:
             "stability_margin": UNCHECKED,
             "feedforward": self.settings.feedforward,
             **of_feedforward(self.arm.known, self.settings.rate),
+            "feedforward_torque": self.uncertainty.torque_share,
+            "motion_delay": numbers([self.settings.delay])[0],
             "saturation": "together",
             "motion_velocity_bandwidth": numbers([self.sampling.joint_corner])[0],
             "motion_rate_bandwidth": numbers([self.sampling.modal_corner])[0],

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""Whether an arm comes to rest after a motion that takes nearly all of its torque.
+r"""Whether an arm comes to rest after a motion that takes as much of its torque as a plan does.
 
 At a torque limit the feedback is weaker than the gains demand. A loop that is stable with its gains, and with any fixed
 fraction of them, may still oscillate with growing amplitude there, since fast gains demand much torque. So the loops
 with the heaviest payload are simulated with the torque limits of the arm file. All joints move at once in the time of
 `settling`, in the direction from one configuration of the design to another (with a single configuration: all joints
-alike). The motion is so large that the feed-forward for the arm of the file takes the fraction `SHARE` of the limits,
-or that a joint reaches its velocity limit. The torque of the feed-forward is :math:`u_m`; it includes the file's
-weight. The feedback after the filters is y. It includes :math:`u_h`, the additional weight of the heavier payload at
-rest, which the integral holds. The torque that is sent is v, as `saturation: together` sends it,
+alike). The motion is so large that the feed-forward for the arm of the file takes as much of the limits as a plan
+(`Uncertainty.torque_share`), or that a joint reaches its velocity limit. The torque of the feed-forward is :math:`u_m`;
+it includes the file's weight. The feedback after the filters is y. It includes :math:`u_h`, the additional weight of
+the heavier payload at rest, which the integral holds. The torque that is sent is v, as `saturation: together` sends it,
 
 .. math:: y_k = u_h + (V - DKN)\,X_k, \qquad
     v_k = u_m + \min_i\Bigl(1, \frac{\pm u_{max,i} - u_{m,i}}{y_{k,i}}\Bigr)\,y_k ,
@@ -36,8 +36,6 @@ from .settling import ANGLE, MOTION, TOLERANCE, Motion
 from .tip import Tip
 from .uncertain import richer
 
-#: Fraction of the torque limits that the motion takes [-].
-SHARE = 0.9
 #: Largest speed of a quintic over its mean speed [-].
 PEAK = 1.875
 #: The tip is watched for this many locked periods after the motion.
@@ -99,7 +97,7 @@ def recovery(nominal, at, sampling, uncertainty, sets):
     sets : ndarray, shape (1 or k, n, 3n + 2m)
         Gains: one set, or one for each configuration.
     """
-    limit = np.array(nominal.arm.torque_limits)
+    limit, share = np.array(nominal.arm.torque_limits), uncertainty.torque_share
     if not nominal.n_modes or not np.isfinite(limit).all():
         return None
     arm, ways = richer(nominal.arm.whole), _ways(at, any(nominal.arm.gravity))
@@ -120,7 +118,7 @@ def recovery(nominal, at, sampling, uncertainty, sets):
         one = _Limited(loop, sets[min(k, len(sets) - 1)], push, tip, heavier, after)
         for way in ways:
             torque = motion.torque.transpose(0, 2, 1) @ way
-            part = _part(torque, SHARE * limit - np.abs(weight), way, arm.velocity_limits, period)
+            part = _part(torque, share * limit - np.abs(weight), way, arm.velocity_limits, period)
             if part > 0.0:
                 given = part * forces @ way, weight + part * torque, weight
                 pairs.append(

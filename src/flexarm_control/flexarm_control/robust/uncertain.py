@@ -9,6 +9,7 @@ from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import DesignError, ModelError
 from flexarm_dynamics.models.model import build
 
+from ..feedforward.base import SHARE
 from .loop import ARM, MARGIN, sampled_loop
 
 #: Joint angles of the drawn configurations are at most this far from straight [rad].
@@ -21,6 +22,11 @@ UNLIKELY = 0.5
 STICKING = {1.0: 0.1, 0.1: 0.3}
 #: Every mode is assumed to have at least this damping ratio [-].
 MIN_DAMPING = 1e-4
+
+
+#: Fraction of the torque limits that a motion may take with the heaviest payload, and the least that it may take with
+#: the file's [-].
+ENOUGH, AT_LEAST = 0.975, 0.5
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,14 @@ class Uncertainty:
     delay: float = 1.0
     edges: bool = False
     at_once: bool = False
+
+    @property
+    def torque_share(self):
+        """Fraction of the torque limits that a motion may take with the file's payload [-].
+
+        Roughly, the torque of a motion grows with the payload. The heaviest one then has just enough of it.
+        """
+        return round(min(SHARE, max(AT_LEAST, ENOUGH / max(1.0, self.payload[1]))), 3)
 
 
 def configurations(arm, seed=0):

@@ -21,6 +21,8 @@ COMMENTS = {
     "feedforward": "preview: each motion is planned on receipt and ends at rest; model: rests a period later",
     "feedforward_modes": "per direction, that the feed-forward knows: one more than the file",
     "feedforward_level": "of the kinematics of bending, likewise, by the arm's loads; file: as the arm file has it",
+    "feedforward_torque": "of the torque limits, that a plan takes: a heavier payload needs the rest",
+    "motion_delay": "[s] the laws see the motion as late as the torque acts, by measurement, up to this",
     "saturation": "a joint at its torque limit scales the feedback of all: the gains are made for its direction",
     "slow.type": "slow control: stiffness, damping and integral of each joint",
     "slow.stiffness": "[N m/rad]",
@@ -346,7 +348,7 @@ def _largest(fractions, arm):
 
 def _recovery(found):
     """How the arm comes back from its torque limits, in words."""
-    from flexarm_control.robust.recovery import SHARE, WATCHED
+    from flexarm_control.robust.recovery import WATCHED
 
     if found.recovery is None:
         return "not looked at: no link bends, a joint has no limit, or the weight takes all torque"
@@ -356,7 +358,7 @@ def _recovery(found):
     )
     return (
         f"payload x {found.uncertainty.payload[1]:g}: settled after {with_}, without limits {without}, after motions"
-        f" that take {SHARE:g} of them"
+        f" that take {found.uncertainty.torque_share:g} of them"
     )
 
 

@@ -58,6 +58,9 @@ class Baseline:
     def resume(self, other):
         """Take nothing over from another law."""
 
+    def take_delay(self, delay):
+        """Take no notice of the measured delay of the torque."""
+
     def step(self, q, qd, delta, delta_d, reference, dt=0.0):
         """Torque for one sample, (n,) [N m]; as `CompositeControl.step`."""
         self.slow_torque[:] = self._torque(np.concatenate([q, delta, qd, delta_d]), reference, dt)

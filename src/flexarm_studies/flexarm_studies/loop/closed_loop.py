@@ -143,7 +143,7 @@ class ClosedLoop:
         converged = observer.step(measured)
         e.stamp_ns, e.session, e.sequence = measured.stamp_ns, measured.session, measured.sequence
         e.position[:] = observer.position
-        e.velocity[:] = observer.velocity
+        e.velocity[:], e.torque[:] = observer.velocity, measured.torque
         e.amplitude = observer.amplitude
         e.rate = observer.rate if converged else None
         e.controller_id, e.trust, e.doubt = measured.controller_id, measured.trust, measured.doubt

@@ -9,7 +9,8 @@ Joint errors and vibration are errors. The tip is settled when it is within `TOL
 and stays so until the run's end, `WINDOW` locked periods after the motion, and at least `MIN_WINDOW`.
 
 The torque does not return in a ramp here (`return_time` 0): a motion begins with the first torque. A real arm is held
-before its motion, so the ramp is over by then.
+before its motion, so the ramp is over by then. Where sensors have noise, the arm is held for `HELD` before its motion:
+its torque then changes, and the control measures the delay of the loop.
 
 Integration: dop853 is used if a few substeps are short enough for the highest mode and for the friction of light hubs.
 Friction damps a joint that reverses at the rate :math:`f_cH/v_0`, with the inverse H of the mass matrix and the
@@ -45,6 +46,8 @@ TOLERANCE = 1e-3
 WINDOW, REST = 6.0, 1.0
 #: The run after the motion is at least this long: a loop may be slow on a fast arm [s].
 MIN_WINDOW = 2.0
+#: An arm with noise is held this long before its motion [s].
+HELD = 0.2
 #: To find the effect of noise alone, the arm is only held, for this many times the window after the motion. By then
 #: every other vibration has died out [-].
 HOLD = 2.0
@@ -144,6 +147,8 @@ def _followed(case, setup, variant, seed, shorter):
     wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
     motion = wanted if setup.motion is None else setup.motion(loop.model)
     loop.simulator.reset(wanted.positions[0])
+    for _ in range(round(1e9 * HELD / loop.simulator.period_ns) if variant.sensors else 0):
+        loop.step()
     end = 1e-9 * int(wanted.times_ns[-1])
     return loop, loop.follow(motion, end + window_of(case)), wanted, end
 
@@ -151,8 +156,10 @@ def _followed(case, setup, variant, seed, shorter):
 def of_noise_alone(case, setup, variant, q, seed=0, shorter=1):
     """Rms of the tip about its mean, as a fraction of the reach [-], of an arm that is only held at `q` [rad].
 
-    It is taken over the last `REST` period, like ``residual_tip`` of a run of the same case, setup and variant; None if
-    the arm can't be held. The steps are `shorter` times as short as usual.
+    It is taken over the last window, and not over one period like ``residual_tip`` of a run of the same case, setup and
+    variant, because vibration that noise makes grows and decays by chance. Of two arms with the same noise, each taken
+    over one period, one in ten would have more than three times the other's. None if the arm can't be held. The steps
+    are `shorter` times as short as usual.
     """
     try:
         loop = _prepared(case, setup, variant, seed)
@@ -165,7 +172,7 @@ def of_noise_alone(case, setup, variant, q, seed=0, shorter=1):
         return None
     if loop.lost:
         return None
-    last = record.time >= record.time[-1] - REST * case.period
+    last = record.time >= record.time[-1] - window_of(case)
     tip = tip_path(
         loop.simulator.plant_model, record.plant_position[last], record.plant_amplitude[last]
     )
