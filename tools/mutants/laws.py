@@ -309,8 +309,20 @@ ERRORS = [
         (
             "planner",
             "torque left to the feedback: a twentieth",
-            "self.share - np.append(here, -here)",
+            "np.append(most - here, most + here)",
             "0.95 - np.append(here, -here)",
+        ),
+        (
+            "planner",
+            "torque left to the feedback: only beyond the limit",
+            "<= most).all()",
+            "<= 1.0).all()",
+        ),
+        (
+            "planner",
+            "a weight that takes most of the torque: as the motion's torque",
+            "row[:] = torque_for_motion(1.0, weight / self.limit, self.share)",
+            "pass",
         ),
         (
             "planner",

@@ -24,18 +24,18 @@ ERRORS = [
     *of(
         "flexarm_control",
         "loop",
-        "flexarm_studies/test/test_simulate_controller.py -k late_torque",
+        "flexarm_studies/test/test_late_torque.py",
         (
             "arm_controller",
             "the measured delay: not given to the law",
-            "self.law.take_delay(self.torque_delay.delay)",
+            "self.law.take_delay(self.torque_delay.known)",
             "pass",
         ),
     ),
     *of(
         "flexarm_control",
         "composite",
-        "flexarm_studies/test/test_simulate_controller.py -k late_torque",
+        "flexarm_studies/test/test_late_torque.py",
         (
             "law",
             "a late torque: the feed-forward is not ahead of the reference",

@@ -98,3 +98,49 @@ def test_an_interruption_and_another_period_begin_the_measurement_anew(interrupt
         if 200 <= j < 200 + LAGS:
             assert meter.count == found > 5
     assert meter.count > found + 5 and meter.delay == pytest.approx(H, abs=1e-9)
+
+
+# --------------------------------------------------------------------------- the delay that the control uses
+
+
+def noisy(samples, size=0.05):
+    return 3.0 + size * np.random.default_rng(2).standard_normal((samples, 1))
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.0, 1.5])
+def test_a_torque_that_changes_by_noise_alone_shows_the_delay(delay):
+    assert measured(noisy(200), delay).known == pytest.approx(H * delay, abs=1e-9)
+    assert measured(noisy(200), delay, noise=0.005).known == pytest.approx(H * delay, abs=0.2 * H)
+    assert np.isnan(measured(noisy(80), delay).known)  # of too few blocks
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        lambda u: np.zeros_like(u),
+        lambda u: np.round(u),  # coarse steps
+        lambda u: 1.0 + 0.3 * np.random.default_rng(3).standard_normal(u.shape),
+    ],
+)
+def test_reports_that_are_not_those_of_the_torque_sent_show_nothing(report):
+    meter, torques = TorqueDelay(1), noisy(3000)
+    reports = report(torques)
+    for torque, now in zip(torques, reports, strict=True):
+        meter.add(now, 1, H)
+        meter.note(torque)
+        meter.judge()
+    assert np.isnan(meter.known)
+
+
+def test_an_offset_of_the_reports_does_not_count_and_with_a_gain_only_much_change_shows_the_delay():
+    smooth, rough = np.sin(2.0 * H * np.arange(2000)[:, None]), noisy(2000)
+    for torques, gain, offset in ((smooth, 1.01, 0.0), (rough, 1.01, 0.0), (rough, 1.0, 0.5)):
+        meter = TorqueDelay(1)
+        for j, torque in enumerate(torques):
+            meter.add(gain * torques[max(j - 3, 0)] + offset, 1, H)  # two periods late
+            meter.note(torque)
+            meter.judge()
+        if torques is smooth:
+            assert np.isnan(meter.known)
+        else:
+            assert meter.known == pytest.approx(2.0 * H, abs=0.05 * H)

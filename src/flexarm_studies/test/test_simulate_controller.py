@@ -597,31 +597,3 @@ def test_the_controller_measures_the_delay_of_its_loop(delay):
         loop.controller.learn()
     assert loop.controller.torque_delay.delay == pytest.approx(delay, abs=1e-8)
     assert loop.controller.period == pytest.approx(1e-3)
-
-
-def there_and_back(delay, motion_delay=0.004):
-    """Of two motions of R: largest joint error [rad], and largest torque beyond the feed-forward's [N m]; (2, 2)."""
-    given = {"feedforward_modes": 0, "motion_delay": motion_delay}
-    loop = loop_of(Scenario("R", parameters("R_designed") | given, delay=delay, rate=500.0))
-    law, found = loop.controller.law, np.zeros((2, 2))
-    for row, angle in zip(found, (0.5, 0.0), strict=True):
-        start = loop.simulator.position.copy()
-        trajectory = trajectory_of(f"quintic:to={angle},duration=1", loop.model, start)
-        for k in range(900):
-            loop.step()
-            fed_back = law.torque - law.feedforward.torque
-            row[:] = np.maximum(row, [abs(loop.controller.position_error[0]), abs(fed_back[0])])
-            if k == 20:
-                assert loop.controller.offer(trajectory, loop.prepared(trajectory)).accepted
-    return found
-
-
-@pytest.mark.parametrize("delay", [0.002, 0.0035])
-def test_once_the_delay_is_measured_a_late_torque_is_no_error_and_the_arm_is_on_time(delay):
-    at_once = there_and_back(0.0)
-    assert at_once[:, 1].max() < 1e-6
-    (_, before), (error, now) = there_and_back(delay)
-    assert error == pytest.approx(at_once[1, 0], rel=0.05)
-    assert now < 0.05 * before
-    (_, before), (_, now) = there_and_back(delay, motion_delay=0.0)
-    assert now == pytest.approx(before, rel=0.05)

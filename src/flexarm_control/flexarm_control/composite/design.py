@@ -53,9 +53,9 @@ PARAMETERS = (
         " filtered_derivative); 0.0: no filter."
     ),
     parameter("motion_delay", 0.0, "s", 0.0, 0.1).described(
-        "Longest delay of the torque that is taken into account: the arm follows the feed-forward's motion as late as"
-        " its torque acts, and the laws see the motion that late. The controller measures the delay; 0.0: the laws see"
-        " the motion without delay."
+        "Longest delay of the torque that is taken into account. The arm follows the feed-forward's motion as late as"
+        " its torque acts, so slow.type joint_pid and the fast law see the motion that late, and the feed-forward is"
+        " ahead of the reference. The controller measures the delay; 0.0: it is not taken into account."
     ),
     parameter("saturation", "each", choices=("each", "together")).described(
         "Effect of the torque limit on the feedback about a feed-forward. each: every joint is clipped by itself;"
@@ -136,8 +136,10 @@ def design(model, slow, fast, manifold=None, settings=None):
         seen = None
     # The manifold keeps the file's kinematics: the regulator of the fuller arm follows it and removes the difference.
     known = None if fuller is model else model
-    shared = chosen["feedforward_spread"], chosen["feedforward_torque"]
-    planning = Settings(1.0 / chosen["rate"], q, known, *shared)
+    # The fraction is for the payload of the arm file. A heavier one that is known needs no torque in reserve.
+    known_part = chosen["feedforward_torque"] * max(1.0, chosen["payload_scale"])
+    share = max(chosen["feedforward_torque"], min(known_part, SHARE))
+    planning = Settings(1.0 / chosen["rate"], q, known, chosen["feedforward_spread"], share)
     motion = kind(fuller, surface.of(modes), planning)
     together = chosen["saturation"] == "together"
     return CompositeControl(model, slow_law, fast_law, surface, motion, seen, together)

@@ -30,9 +30,6 @@ from .seen import SeenMotion
 #: after two periods.
 PAYLOAD_FADING = 8.4 / (4.0 * np.pi)
 
-#: Weight of the newest measurement in the mean delay of the torque [-].
-NEWEST = 0.2
-
 
 class CompositeControl:
     """Slow law, slow manifold and fast law together; every array of the last step stays readable.
@@ -103,9 +100,8 @@ class CompositeControl:
             self.feedforward.limit = value
 
     def take_delay(self, delay):
-        """Take a measured time from a sample until the torque that answers it acts [s]."""
-        known = self._delay
-        self._delay = known + NEWEST * (delay - known) if np.isfinite(known) else delay
+        """Take the measured time from a sample until the torque that answers it acts [s]; NaN: not known."""
+        self._delay = delay
 
     def warnings(self):
         """What a user should know about these laws on this arm; each a sentence."""
@@ -222,25 +218,26 @@ class CompositeControl:
         if dt > 0.0:
             self.slow.advance(dt)
             self.fast.advance(dt)
-        if isinstance(self._seen, SeenMotion):
+        if self.feedforward is not None:
             reference = self._led(reference)
             self.feedforward.update(reference, dt)
-            self._seen.update(dt)
-        elif self.feedforward is not None:
-            self.feedforward.update(reference, dt)
+            if self._seen is not self.feedforward:
+                self._seen.update(dt)
         self._last = reference, dt
 
     def _led(self, reference):
         """The reference that the feed-forward follows: so far ahead that the arm, whose torque is late, is on time.
 
-        The delay that has been measured by then is taken while the reference rests, and kept during a motion.
+        The delay that has been measured by then is taken while no trajectory is followed, and kept until its end.
         """
         path, stamp_ns = getattr(reference, "path", None), getattr(reference, "stamp_ns", 0)
-        if path is None or path.piece(stamp_ns) == Path.END:
+        if path is not None and path.piece(stamp_ns) != Path.END:
+            return At(path, stamp_ns + self._lead_ns) if self._lead_ns else reference
+        self._lead_ns = 0
+        if isinstance(self._seen, SeenMotion):
             self._seen.be_late(self._delay)
             self._lead_ns = round(self._seen.late * SECOND)
-            return reference
-        return At(path, stamp_ns + self._lead_ns) if self._lead_ns else reference
+        return reference
 
     def _slow_on_manifold(self, q, qd, reference, dt):
         """Slow torque towards the reference, including the manifold's torque, and the manifold's z_bar."""

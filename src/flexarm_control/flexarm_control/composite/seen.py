@@ -51,7 +51,7 @@ class SeenMotion:
     joint_corner, rate_corner : float
         Corners of the observer's filters of joint speeds and of rates of deflections [rad/s]; 0.0: not filtered.
     longest : float
-        The motion is seen at most this late [s]; 0.0: nothing of it is remembered.
+        The motion is seen at most this late [s].
     shown : ndarray, shape (m, k), optional
         What the gauges show of the motion's own k modes; if not given, all modes as they are.
 
@@ -61,6 +61,8 @@ class SeenMotion:
         [rad/s]
     amplitude, rate : ndarray, shape (m,)
         [m, rad], [m/s, rad/s]
+    position : ndarray, shape (n,)
+        [rad]
     late : float
         How late the motion is seen [s].
     """
@@ -74,39 +76,61 @@ class SeenMotion:
         self._own_rate = self.rate.copy()
         self._last = motion.position.copy(), self.amplitude.copy()
         self.late = 0.0
-        rows = REMEMBERED if longest else 0
-        self._states, self._intervals = np.zeros((rows, 2 * (n + k))), np.full(rows, np.inf)
-        self._newest, self._state = 0, np.zeros(2 * (n + k))
+        # States of the motion, and the time from the one before; whether the next one follows on the newest.
+        self._states, self._intervals = np.zeros((REMEMBERED, 2 * (n + k))), np.zeros(REMEMBERED)
+        self._newest, self._goes_on = 0, False
+        self._state = np.zeros(2 * (n + k))  # that is seen
+        self._fresh = True  # no sample so far
+        self._name_parts()
+
+    def _name_parts(self):
+        n, k = self._motion.position.size, self._motion.rate.size
         self._parts = np.split(self._state, [n, n + k, 2 * n + k])
+
+    def __getstate__(self):
+        """Without the views of the seen state: for another process."""
+        return {name: value for name, value in self.__dict__.items() if name != "_parts"}
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        self._name_parts()
+
+    @property
+    def _remembers(self):
+        return self._longest > 0.0 or self.late > 0.0
 
     @property
     def position(self):
-        """Joints of the motion, (n,) [rad]."""
-        return self._parts[0] if self._longest else self._motion.position
+        """Joints of the motion as they are seen, (n,) [rad]."""
+        return self._parts[0] if self._remembers else self._motion.position
 
     def be_late(self, delay):
-        """See the motion so late from now on [s], as far as it is remembered; NaN: as late as before."""
-        if delay >= 0.0:
-            self.late = min(delay, self._longest)
+        """See the motion so late from now on [s], but at most `longest`; NaN: as late as before.
+
+        Call it while the motion rests: otherwise what is seen jumps.
+        """
+        self.late = min(delay if delay >= 0.0 else self.late, self._longest)
 
     def take(self, other):
-        """Go on from the state of another `SeenMotion` of the same motion."""
+        """Go on from the state of another `SeenMotion` of the same motion, as late as that one."""
         mine = (*self._last, self.velocity, self.rate)
         for values, its in zip(mine, (*other._last, other.velocity, other.rate), strict=True):
             values[:] = its
-        if self._states.shape == other._states.shape:
-            self.late, self._newest = min(other.late, self._longest), other._newest
+        self.late, self._fresh = other.late, other._fresh
+        if other._goes_on and self._states.shape == other._states.shape:
+            self._newest, self._goes_on = other._newest, True
             self._states[:], self._intervals[:] = other._states, other._intervals
             self._state[:] = other._state
 
     def update(self, dt):
         """Move on to the motion's present sample, `dt` [s] after the last one; 0: the first sample."""
         motion, own_rate = self._motion, self._own_rate
-        position, amplitude, velocity, rate = (
-            self._before(dt)
-            if self._longest
-            else (motion.position, motion.amplitude, motion.velocity, motion.rate)
-        )
+        if self._remembers:
+            position, amplitude, velocity, rate = self._before(dt)
+        else:
+            position, amplitude = motion.position, motion.amplitude
+            velocity, rate = motion.velocity, motion.rate
+            self._goes_on = False
         np.dot(self._shown, amplitude, out=self.amplitude)
         np.dot(self._shown, rate, out=own_rate)
         places, rates = (position, self.amplitude), (self.velocity, self.rate)
@@ -115,9 +139,10 @@ class SeenMotion:
             if corner == 0.0 or dt <= 0.0:
                 rate[:], last[:] = own, place
                 continue
-            if motion.placed:  # a jump of the position is no speed
+            if motion.placed or self._fresh:  # a jump of the position is no speed
                 last[:] = place - dt * own
             kernels.compiled().filtered_derivative(place, dt, corner, last, rate)
+        self._fresh = False
 
     def _before(self, dt):
         """Note the motion's present state; return its parts (q, delta, qd, delta_d) of `late` ago."""
@@ -127,6 +152,7 @@ class SeenMotion:
             [motion.position, motion.amplitude, motion.velocity, motion.rate],
             out=self._states[row],
         )
-        self._intervals[row] = np.inf if motion.placed or dt <= 0.0 else dt
+        follows = self._goes_on and dt > 0.0 and not motion.placed
+        self._intervals[row], self._goes_on = dt if follows else np.inf, True
         kernels.compiled().state_before(self.late, row, self._intervals, self._states, self._state)
         return self._parts

@@ -46,7 +46,7 @@ from flexarm_dynamics.models.model import made
 
 from .. import kernels
 from ..trajectory.values import SECOND
-from .base import SHARE
+from .base import SHARE, torque_for_motion
 
 #: Knots of the shift per period of the lowest bending mode.
 KNOTS_PER_PERIOD = 6.0
@@ -242,14 +242,23 @@ class Planner:
         return np.linalg.norm(there - self.model.tip_position(q, self.rest)) / SMALL
 
     def solve(self):
-        """The plan, after up to `ROUNDS` rounds, each about the result of the last one."""
+        """The plan, after up to `ROUNDS` rounds, each about the result of the last one.
+
+        If there is none, more of the torque is used; if there is still none, modes that can't be brought to rest are
+        left as they are.
+        """
         try:
             return self._solved()
+        except Unbounded:
+            raise
         except DesignError:
-            if self._others is None:
+            if self.share < SHARE:
+                self.share = SHARE
+            elif self._others is not None:
+                self.spread, self._others = 0.0, None
+            else:
                 raise
-        self.spread, self._others = 0.0, None
-        return self._solved()
+        return self.solve()
 
     def _solved(self):
         n = self.model.n_joints
@@ -401,6 +410,7 @@ class Planner:
         scale = 1.0 / np.abs(A).max(axis=1)
         A, b = A * scale[:, None], b * scale
         _, u = finite(*self._forces(at, x, v))
+        self._most = self._for_motion(at)
         return self._within_limits(c, A, b, self._quiet(c, x, v, knots), u, self.torque_by)
 
     def _take_end(self, forced):
@@ -470,10 +480,21 @@ class Planner:
                 hint="give it more time",
             )
 
+    def _for_motion(self, at):
+        """Torque over the limit that the motion should take at some whole steps, (k, n) [-]."""
+        most = np.full((at.size, self.limit.size), self.share)
+        if not any(self.model.arm.gravity):
+            return most
+        still = np.zeros(self.limit.size)
+        for row, k in zip(most, at, strict=True):
+            weight = self.model.terms(self.reference[2 * k, 0], still).f1
+            row[:] = torque_for_motion(1.0, weight / self.limit, self.share)
+        return most
+
     def _within_limits(self, c, A, b, quiet, u, du):
         """The change x (n, count) with A x = b after which the function of the module is smallest.
 
-        Torque, u + du x, beyond `share` of the limit is penalised by the square of what is beyond, over the limit.
+        Torque, u + du x, beyond `torque_for_motion` is penalised by the square of what is beyond, over the limit.
         """
         n, count = c.shape
         N, Ndd = self.basis[0], self.basis[2] / self.omega**2
@@ -489,9 +510,10 @@ class Planner:
         here = (u[:, limited] / limit).ravel()
         by = (du[:, limited] / limit[:, None]).reshape(here.size, n * count)
         change = _least(H, right, A, b)
-        if (np.abs(here + by @ change) <= self.share).all():
+        most = self._most[:, limited].ravel()
+        if (np.abs(here + by @ change) <= most).all():
             return change.reshape(n, count)
-        rows, values = np.vstack([by, -by]), self.share - np.append(here, -here)
+        rows, values = np.vstack([by, -by]), np.append(most - here, most + here)
         return _penalised(H, right, A, b, rows, values, change).reshape(n, count)
 
 

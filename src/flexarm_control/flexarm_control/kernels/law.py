@@ -244,12 +244,14 @@ def weights_between(q, at, joints, weights):
 
 
 def state_before(late, newest, intervals, states, out):
-    """Fill `out` (k,) with the state that was newest some time ago, linear between the samples.
+    """Fill `out` (k,) with the state some time ago: half of it positions, the other half their rates.
+
+    Between samples it is the cubic with the positions and rates of both. Before the first one, the rates are constant.
 
     Parameters
     ----------
     late : float
-        How long ago [s]; if this is before the oldest sample, that one is taken.
+        How long ago [s].
     newest : int
         Row of the newest sample in the ring of rows.
     intervals : ndarray, shape (s,)
@@ -259,12 +261,22 @@ def state_before(late, newest, intervals, states, out):
     out : ndarray, shape (k,)
         Filled.
     """
-    size, i, part = intervals.size, newest, 0.0
+    size, half, i, between = intervals.size, out.size // 2, newest, False
     for _ in range(size - 1):
         if late < intervals[i]:
-            part = late / intervals[i]
+            between = late > 0.0 and np.isfinite(intervals[i])
             break
         late -= intervals[i]
         i = (i - 1) % size
-    for k in range(out.size):
-        out[k] = (1.0 - part) * states[i, k] + part * states[i - 1, k]
+    for k in range(half):
+        position, rate = states[i, k], states[i, half + k]
+        if between:
+            h = intervals[i]
+            s, before = 1.0 - late / h, states[i - 1, k]
+            slope, change = states[i - 1, half + k], (position - before) / h
+            a, b = 3.0 * change - 2.0 * slope - rate, slope + rate - 2.0 * change
+            out[k] = before + h * s * (slope + s * (a + s * b))
+            out[half + k] = slope + s * (2.0 * a + 3.0 * s * b)
+        else:
+            out[k] = position - late * rate if late > 0.0 else position
+            out[half + k] = rate

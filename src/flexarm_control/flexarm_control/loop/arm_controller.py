@@ -169,8 +169,8 @@ class ArmController:
 
     def learn(self):
         """Learn the loop's delay and the payload from the last samples; call once the torque is sent."""
-        if self.torque_delay.judge():
-            self.law.take_delay(self.torque_delay.delay)
+        self.torque_delay.judge()
+        self.law.take_delay(self.torque_delay.known)
         if self.payload is not None and self.enabled:
             self.payload.update(self.reference.resting is not None)
 

@@ -10,7 +10,14 @@ Over a block of samples, f follows for each k by least squares, and the k with t
 lost state has no answer, so the torque before it goes on. A torque that hardly changes does not show the delay. Nor
 does one that fits no k. If a driver reports the torque at the stamp, and not the mean before it, the delay looks
 shorter by up to a period.
+
+The control relies on the delay that is `known`. For it, the means over the block are subtracted, so that an offset of
+what the driver reports does not count. A gain does: if the torque changes smoothly, a gain of 1.01 looks like a delay
+of several periods. So only blocks count that fit well, and whose torque changes by much from sample to sample. At rest
+it does so because the sensors have noise.
 """
+
+from collections import deque
 
 import numpy as np
 
@@ -21,6 +28,10 @@ LAGS, BLOCK, SENT = 32, 16, 128
 FITS = 0.5
 #: Smallest change of the torque from sample to sample that shows a delay, as a fraction of the torque's size [-].
 CHANGES = 1e-8
+#: The delay is known from blocks whose residual is at most the first number times the torque's change and deviation
+#: from its mean, as sums of squares, and whose change is at least the second number times this deviation [-]. It is the
+#: median of the last `MEDIAN` of these blocks, and of `LEAST` at least.
+FITS_WELL, CHANGES_MUCH, MEDIAN, LEAST = 0.05, 0.1, 5, 3
 #: A period that differs from the last one by more than this fraction begins a new block [-].
 SAME = 0.2
 
@@ -39,10 +50,13 @@ class TorqueDelay:
         Delay of the last block that shows one [s]; NaN before the first.
     count : int
         Number of blocks that have shown a delay.
+    known : float
+        Delay that the control can rely on [s]; NaN: not known.
     """
 
     def __init__(self, n):
-        self.delay, self.count = np.nan, 0
+        self.delay, self.count, self.known = np.nan, 0, np.nan
+        self._last = deque(maxlen=MEDIAN)
         self._sent = np.zeros((SENT, n))  # by periods, the newest at `_now`
         self._reported, self._at = np.zeros((BLOCK, 1, n)), np.zeros((BLOCK, 1), int)
         self._ages = np.arange(LAGS + 2)
@@ -85,24 +99,44 @@ class TorqueDelay:
         self._size += 1
 
     def judge(self):
-        """Take the delay from a complete block, and return whether it shows one; call once the torque is sent."""
+        """Take the delay from a complete block, if it shows one; call once the torque is sent."""
         if self._size < BLOCK:
-            return False
+            return
         self._size = 0
         first = int(self._at[0, 0])
         if first <= LAGS + 1 or self._now - first + LAGS + 2 > SENT:
-            return False
+            return
         u, r, d = self._u, self._rest, self._change
         np.take(self._sent, (self._at - self._ages) % SENT, axis=0, out=u)
         np.subtract(self._reported, u[:, :-1], out=r)
         np.subtract(u[:, 1:], u[:, :-1], out=d)
+        delay, rest, change = self._fitted(r, d)
+        least = CHANGES**2 * np.vdot(self._reported, self._reported)
+        if change > least and rest <= FITS * change:
+            self.delay = delay
+            self.count += 1
+        self._rely_on(r, d, least)
+
+    def _fitted(self, r, d):
+        """Delay [s] of the k with the smallest residual, the residual, and the torque's change from sample to sample.
+
+        Residual and change are sums of squares. The residuals r, without part f, and the changes d are (BLOCK, k, n).
+        """
         rest, both, change = (np.einsum("ikn,ikn->k", a, b) for a, b in ((r, r), (r, d), (d, d)))
         f = np.clip(both / np.maximum(change, 1e-300), 0.0, 1.0)
         rest -= f * (2.0 * both - f * change)
         k = int(np.argmin(rest))
-        size = np.vdot(self._reported, self._reported)
-        if not (change[k] > CHANGES**2 * size and rest[k] <= FITS * change[k]):
-            return False
-        self.delay = float((k + f[k]) * self._period)
-        self.count += 1
-        return True
+        return float((k + f[k]) * self._period), rest[k], change[k]
+
+    def _rely_on(self, r, d, least):
+        """Take the block for `known`, if it fits well without means, and its torque changes much."""
+        for values in (r, d):
+            values -= values.mean(axis=0)
+        delay, rest, change = self._fitted(r, d)
+        reported = self._reported - self._reported.mean(axis=0)
+        varies = np.vdot(reported, reported)
+        fits = rest <= FITS_WELL * min(change, varies)
+        if fits and change > least and change >= CHANGES_MUCH**2 * varies:
+            self._last.append(delay)
+            if len(self._last) >= LEAST:
+                self.known = float(np.median(self._last))

@@ -6,9 +6,10 @@ fraction of them, may still oscillate with growing amplitude there, since fast g
 with the heaviest payload are simulated with the torque limits of the arm file. All joints move at once in the time of
 `settling`, in the direction from one configuration of the design to another (with a single configuration: all joints
 alike). The motion is so large that the feed-forward for the arm of the file takes as much of the limits as a plan
-(`Uncertainty.torque_share`), or that a joint reaches its velocity limit. The torque of the feed-forward is :math:`u_m`;
-it includes the file's weight. The feedback after the filters is y. It includes :math:`u_h`, the additional weight of
-the heavier payload at rest, which the integral holds. The torque that is sent is v, as `saturation: together` sends it,
+(`Uncertainty.torque_share`, `torque_for_motion`), or that a joint reaches its velocity limit. The torque of the
+feed-forward is :math:`u_m`; it includes the file's weight. The feedback after the filters is y. It includes
+:math:`u_h`, the additional weight of the heavier payload at rest, which the integral holds. The torque that is sent is
+v, as `saturation: together` sends it,
 
 .. math:: y_k = u_h + (V - DKN)\,X_k, \qquad
     v_k = u_m + \min_i\Bigl(1, \frac{\pm u_{max,i} - u_{m,i}}{y_{k,i}}\Bigr)\,y_k ,
@@ -30,6 +31,7 @@ from flexarm_dynamics.errors import ModelError
 from flexarm_dynamics.linear import static_torque
 from flexarm_dynamics.models.model import build
 
+from ..feedforward.base import torque_for_motion
 from ..kernels import compiled
 from .loop import sampled_loop
 from .settling import ANGLE, MOTION, TOLERANCE, Motion
@@ -115,10 +117,11 @@ def recovery(nominal, at, sampling, uncertainty, sets):
             continue
         after = int(np.ceil(WATCHED * period / sampling.period))
         tip = Tip(plant, q).J / (TOLERANCE * arm.reach)
+        room = torque_for_motion(limit, weight, share) - np.abs(weight)
         one = _Limited(loop, sets[min(k, len(sets) - 1)], push, tip, heavier, after)
         for way in ways:
             torque = motion.torque.transpose(0, 2, 1) @ way
-            part = _part(torque, share * limit - np.abs(weight), way, arm.velocity_limits, period)
+            part = _part(torque, room, way, arm.velocity_limits, period)
             if part > 0.0:
                 given = part * forces @ way, weight + part * torque, weight
                 pairs.append(

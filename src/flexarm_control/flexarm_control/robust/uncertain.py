@@ -25,7 +25,7 @@ MIN_DAMPING = 1e-4
 
 
 #: Fraction of the torque limits that a motion may take with the heaviest payload, and the least that it may take with
-#: the file's [-].
+#: the file's, whatever the heaviest one is [-].
 ENOUGH, AT_LEAST = 0.975, 0.5
 
 
@@ -59,7 +59,8 @@ class Uncertainty:
     def torque_share(self):
         """Fraction of the torque limits that a motion may take with the file's payload [-].
 
-        Roughly, the torque of a motion grows with the payload. The heaviest one then has just enough of it.
+        The torque of a motion grows with the payload, at most in proportion to it. Up to a payload of
+        `ENOUGH` / `AT_LEAST`, the heaviest one has enough of it.
         """
         return round(min(SHARE, max(AT_LEAST, ENOUGH / max(1.0, self.payload[1]))), 3)
 

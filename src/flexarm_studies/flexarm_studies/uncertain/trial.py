@@ -28,11 +28,13 @@ repeated in steps `SHORTER` times as short, and the arm counts as lost if it is 
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
+from flexarm_control.loop.supervisor import State
 from flexarm_dynamics.arm.description import Arm
-from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.errors import FlexarmError, ModelError
 from flexarm_dynamics.models import levels, model
 from flexarm_sim.integrators import substeps, turning_rate
 
@@ -47,7 +49,7 @@ WINDOW, REST = 6.0, 1.0
 #: The run after the motion is at least this long: a loop may be slow on a fast arm [s].
 MIN_WINDOW = 2.0
 #: An arm with noise is held this long before its motion [s].
-HELD = 0.2
+HELD = 0.3
 #: To find the effect of noise alone, the arm is only held, for this many times the window after the motion. By then
 #: every other vibration has died out [-].
 HOLD = 2.0
@@ -67,6 +69,17 @@ DAMPED = 1.0
 SHORTER = 3
 #: Largest angle by which friction moves a hub in one step [rad].
 KICK = np.radians(0.01)
+#: Numbers of a run that was lost before they could be judged.
+NOT_REACHED = {
+    "peak_joint_error_deg": None,
+    "settling_s": None,
+    "settling_periods": None,
+    "rest_joint_deg": None,
+    "rest_tip": None,
+    "residual_tip": None,
+    "settled": False,
+    "at_rest": False,
+}
 
 
 @dataclass(frozen=True)
@@ -130,6 +143,8 @@ def run(case, setup, variant, seed=0):
             loop, record, wanted, end = _followed(case, setup, variant, seed, shorter)
     except FlexarmError as error:
         return {"refused": str(error)}
+    if record is None:  # lost before its motion
+        return NOT_REACHED | {"lost": loop.lost}
     with np.errstate(over="ignore", invalid="ignore"):
         found = judged(case, loop.simulator.plant_model, _as_wanted(record, wanted, loop), end)
     if loop.lost:
@@ -147,19 +162,32 @@ def _followed(case, setup, variant, seed, shorter):
     wanted = scenarios.trajectory_of(case.motion, loop.model, loop.simulator.position)
     motion = wanted if setup.motion is None else setup.motion(loop.model)
     loop.simulator.reset(wanted.positions[0])
-    for _ in range(round(1e9 * HELD / loop.simulator.period_ns) if variant.sensors else 0):
-        loop.step()
+    if variant.sensors and (reason := _lost_while_held(loop)):
+        loop.lost = reason
+        return loop, None, wanted, 0.0
     end = 1e-9 * int(wanted.times_ns[-1])
     return loop, loop.follow(motion, end + window_of(case)), wanted, end
+
+
+def _lost_while_held(loop):
+    """Hold the arm for `HELD`; return why it was lost, or nothing."""
+    for _ in range(round(1e9 * HELD / loop.simulator.period_ns)):
+        try:
+            loop.step()
+        except ModelError as error:
+            return str(error)
+        if loop.controller.state == State.FAULT:
+            return loop.controller.reason
+    return ""
 
 
 def of_noise_alone(case, setup, variant, q, seed=0, shorter=1):
     """Rms of the tip about its mean, as a fraction of the reach [-], of an arm that is only held at `q` [rad].
 
-    It is taken over the last window, and not over one period like ``residual_tip`` of a run of the same case, setup and
-    variant, because vibration that noise makes grows and decays by chance. Of two arms with the same noise, each taken
-    over one period, one in ten would have more than three times the other's. None if the arm can't be held. The steps
-    are `shorter` times as short as usual.
+    It is taken over all periods of the last window, and not over one like ``residual_tip`` of a run of the same case,
+    setup and variant, because vibration that noise makes grows and decays by chance. Of two arms with the same noise,
+    each taken over one period, one in ten would have more than three times the other's. None if the arm can't be held.
+    The steps are `shorter` times as short as usual.
     """
     try:
         loop = _prepared(case, setup, variant, seed)
@@ -172,11 +200,17 @@ def of_noise_alone(case, setup, variant, q, seed=0, shorter=1):
         return None
     if loop.lost:
         return None
-    last = record.time >= record.time[-1] - window_of(case)
-    tip = tip_path(
-        loop.simulator.plant_model, record.plant_position[last], record.plant_amplitude[last]
-    )
-    return _finite(residual_vibration(tip) / case.read().reach)
+    window = window_of(case)
+    period = REST * case.period or window
+    ends = record.time[-1] - period * np.arange(int(window / period) + 1)
+    each = []
+    for end, begin in pairwise(ends):
+        part = (record.time >= begin) & (record.time <= end)
+        tip = tip_path(
+            loop.simulator.plant_model, record.plant_position[part], record.plant_amplitude[part]
+        )
+        each.append(residual_vibration(tip))
+    return _finite(np.sqrt(np.mean(np.square(each))) / case.read().reach)
 
 
 def _prepared(case, setup, variant, seed):
@@ -283,16 +317,7 @@ def judged(case, plant, record, end):
     """
     moving = record.time >= -1e-9
     error = np.degrees(joint_error(record.reference, record.plant_position)[moving])
-    found = {
-        "peak_joint_error_deg": _finite(error.max(initial=0.0)),
-        "settling_s": None,
-        "settling_periods": None,
-        "rest_joint_deg": None,
-        "rest_tip": None,
-        "residual_tip": None,
-        "settled": False,
-        "at_rest": False,
-    }
+    found = NOT_REACHED | {"peak_joint_error_deg": _finite(error.max(initial=0.0))}
     if record.time[-1] < end + window_of(case) - 0.01:
         return found  # lost on the way
     reach = plant.arm.reach
