@@ -174,8 +174,8 @@ ERRORS = [
         (
             "seen",
             "a motion that is put elsewhere: seen from before",
-            "np.inf if motion.placed or dt <= 0.0 else dt",
-            "np.inf if dt <= 0.0 else dt",
+            "dt > 0.0 and not motion.placed",
+            "dt > 0.0",
         ),
         (
             "seen",

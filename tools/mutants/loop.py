@@ -42,11 +42,41 @@ ERRORS = [
             "self._lead_ns = round(self._seen.late * SECOND)",
             "self._lead_ns = 0",
         ),
+        (
+            "seen",
+            "a late torque: a motion is seen from zero at first",
+            "follows = self._goes_on and dt > 0.0",
+            "follows = dt > 0.0",
+        ),
+        (
+            "seen",
+            "a late torque: a control from another process sees nothing",
+            "(state)\n        self._name_parts()\n",
+            "(state)\n        self._name_parts()\n        self._state = self._state.copy()\n",
+        ),
     ),
     *of(
         "flexarm_control",
         "loop",
         TESTS + "test_torque_delay.py",
+        (
+            "torque_delay",
+            "the delay for the control: an offset counts",
+            "sums - BLOCK * np.array(means)",
+            "sums",
+        ),
+        (
+            "torque_delay",
+            "the delay for the control: also from reports that never change",
+            "FITS_WELL * min(change, varies)",
+            "FITS * change",
+        ),
+        (
+            "torque_delay",
+            "the delay for the control: also from a torque that changes smoothly",
+            " and change >= CHANGES_MUCH**2 * varies:",
+            ":",
+        ),
         ("torque_delay", "whole periods only", "float((k + f[k])", "float((k + 0.0 * f[k])"),
         (
             "torque_delay",

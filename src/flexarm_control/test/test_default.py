@@ -120,7 +120,8 @@ def test_the_code_that_names_a_design_has_all_that_gains_follow_from():
         "loop.samples",
         "trajectory",
     }
-    assert {f"{name}.py" for name in imported - other} == set(cache.TAKEN)
+    taken = {f"{name.replace('.', '/')}.py" for name in imported - other}
+    assert taken == set(cache.TAKEN)
 
 
 def _cut(text):

@@ -110,29 +110,28 @@ class TorqueDelay:
         np.take(self._sent, (self._at - self._ages) % SENT, axis=0, out=u)
         np.subtract(self._reported, u[:, :-1], out=r)
         np.subtract(u[:, 1:], u[:, :-1], out=d)
-        delay, rest, change = self._fitted(r, d)
+        sums = np.array([np.einsum("ikn,ikn->k", x, y) for x, y in ((r, r), (r, d), (d, d))])
+        delay, rest, change = self._fitted(*sums)
         least = CHANGES**2 * np.vdot(self._reported, self._reported)
         if change > least and rest <= FITS * change:
             self.delay = delay
             self.count += 1
-        self._rely_on(r, d, least)
+        r, d = r.mean(axis=0), d.mean(axis=0)
+        means = [np.einsum("kn,kn->k", x, y) for x, y in ((r, r), (r, d), (d, d))]
+        self._rely_on(*self._fitted(*(sums - BLOCK * np.array(means))), least)
 
-    def _fitted(self, r, d):
+    def _fitted(self, rest, both, change):
         """Delay [s] of the k with the smallest residual, the residual, and the torque's change from sample to sample.
 
-        Residual and change are sums of squares. The residuals r, without part f, and the changes d are (BLOCK, k, n).
+        For each k, (LAGS + 1,): sums of squares of what is left without f, and of the changes, and their product.
         """
-        rest, both, change = (np.einsum("ikn,ikn->k", a, b) for a, b in ((r, r), (r, d), (d, d)))
         f = np.clip(both / np.maximum(change, 1e-300), 0.0, 1.0)
-        rest -= f * (2.0 * both - f * change)
+        rest = rest - f * (2.0 * both - f * change)
         k = int(np.argmin(rest))
         return float((k + f[k]) * self._period), rest[k], change[k]
 
-    def _rely_on(self, r, d, least):
+    def _rely_on(self, delay, rest, change, least):
         """Take the block for `known`, if it fits well without means, and its torque changes much."""
-        for values in (r, d):
-            values -= values.mean(axis=0)
-        delay, rest, change = self._fitted(r, d)
         reported = self._reported - self._reported.mean(axis=0)
         varies = np.vdot(reported, reported)
         fits = rest <= FITS_WELL * min(change, varies)

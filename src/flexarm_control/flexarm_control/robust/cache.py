@@ -19,7 +19,7 @@ from flexarm_dynamics.kernels.load import cache_directory
 #: Fields of an arm on which no design depends.
 WORDS = ("name", "description", "source")
 #: Modules outside this package on which a design's gains depend.
-TAKEN = ("fading.py", "low_pass.py", "schedule.py")
+TAKEN = ("fading.py", "feedforward/base.py", "low_pass.py", "schedule.py")
 
 
 @once

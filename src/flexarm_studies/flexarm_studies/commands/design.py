@@ -157,7 +157,7 @@ def design(options):
         out.write_text(text, encoding="utf-8")
     if not found.comes_back:
         lines.append(
-            "warning: after a motion that takes nearly all its torque the arm swings for long; move it more slowly"
+            "warning: after a motion that takes much of its torque the arm swings for long; move it more slowly"
         )
     cycles = _limit_cycles(found, arm, settings.delay)
     lines += [f"warning: {cycle.text}" for cycle in cycles]
