@@ -15,8 +15,8 @@ SHARE = 0.95
 def torque_for_motion(limit, weight, share):
     r"""Largest torque that a motion should take, (…, n) [N m], of the `limit` (n,).
 
-    It is the `share` of the limit. If the weight takes most of that, it is the `weight` (…, n) and half the share of
-    what the weight leaves.
+    It is the fraction `share` of the limit. If the weight takes most of that, it is the `weight` (…, n), and half of
+    this fraction of what the weight leaves.
     """
     weight = np.abs(weight)
     return np.maximum(share * limit, weight + 0.5 * share * (limit - weight))
