@@ -13,7 +13,7 @@ SHARE = 0.95
 
 
 def torque_for_motion(limit, weight, share):
-    r"""Largest torque that a motion should take, (…, n) [N m], of the `limit` (n,).
+    """Largest torque that a motion should take, (…, n) [N m], of the `limit` (n,).
 
     It is the fraction `share` of the limit. If the weight takes most of that, it is the `weight` (…, n), and half of
     this fraction of what the weight leaves.

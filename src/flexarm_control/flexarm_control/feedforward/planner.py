@@ -410,8 +410,8 @@ class Planner:
         scale = 1.0 / np.abs(A).max(axis=1)
         A, b = A * scale[:, None], b * scale
         _, u = finite(*self._forces(at, x, v))
-        self._most = self._for_motion(at)
-        return self._within_limits(c, A, b, self._quiet(c, x, v, knots), u, self.torque_by)
+        quiet, most = self._quiet(c, x, v, knots), self._for_motion(at)
+        return self._within_limits(c, A, b, quiet, u, self.torque_by, most)
 
     def _take_end(self, forced):
         """Keep how the planned modes respond at the end, from `_respond`'s last row, and which of them are moved."""
@@ -491,10 +491,10 @@ class Planner:
             row[:] = torque_for_motion(1.0, weight / self.limit, self.share)
         return most
 
-    def _within_limits(self, c, A, b, quiet, u, du):
+    def _within_limits(self, c, A, b, quiet, u, du, most):
         """The change x (n, count) with A x = b after which the function of the module is smallest.
 
-        Torque, u + du x, beyond `torque_for_motion` is penalised by the square of what is beyond, over the limit.
+        Torque over the limit, of u + du x, beyond `most` (k, n) is penalised by the square of what is beyond.
         """
         n, count = c.shape
         N, Ndd = self.basis[0], self.basis[2] / self.omega**2
@@ -510,7 +510,7 @@ class Planner:
         here = (u[:, limited] / limit).ravel()
         by = (du[:, limited] / limit[:, None]).reshape(here.size, n * count)
         change = _least(H, right, A, b)
-        most = self._most[:, limited].ravel()
+        most = most[:, limited].ravel()
         if (np.abs(here + by @ change) <= most).all():
             return change.reshape(n, count)
         rows, values = np.vstack([by, -by]), np.append(most - here, most + here)
