@@ -275,6 +275,22 @@ def test_a_plan_that_is_not_found_with_such_modes_is_made_without_them(monkeypat
     assert_allclose(plan.torque, plan_of(89, 0.0).torque)
 
 
+def test_where_too_little_torque_leaves_no_plan_more_of_it_is_used(monkeypatch):
+    tries = []
+
+    def fails_below(self):
+        tries.append((self.share, self.spread))
+        if self.share < base.SHARE:
+            raise DesignError("none", field="preview")
+        return "plan"
+
+    monkeypatch.setattr(Planner, "_solved", fails_below)
+    ours, _ = planners(89, 0.15)
+    ours.share = 0.75
+    assert ours.solve() == "plan"
+    assert tries == [(0.75, 0.15), (base.SHARE, 0.15)]
+
+
 def test_arms_with_other_frequencies_carry_the_same_payload():
     case = generator.arm(89)
     known = model.build(case.read().known)
