@@ -64,20 +64,22 @@ demo: build
 TESTS := tests $(wildcard src/*/test)
 LONG ?= $(if $(findstring -k,$(PYTEST_ARGS))$(findstring ::,$(PYTEST_ARGS)),all,none)
 REAL_TIME = $(shell grep -l real_time $(foreach folder,$(TESTS),$(wildcard $(folder)/test_*.py)))
+# If one of the two processes dies, the run ends and fails: with another in its place, xdist waits for ever.
+TWO := -n 2 --dist loadgroup --max-worker-restart=0
 # Two processes with several threads each hold each other up: small matrices then take several times as long.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 # Hundreds of processes import the same modules: each is compiled once, also where the environment forbids to keep that.
 KEEP_COMPILED := export PYTHONDONTWRITEBYTECODE=
 test: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; $(KEEP_COMPILED); \
-	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not real_time" --long $(LONG) $(PYTEST_ARGS) $(TESTS); others=$$?; \
+	$(ONE_THREAD) python -m pytest -q $(TWO) -m "not real_time" --long $(LONG) $(PYTEST_ARGS) $(TESTS); others=$$?; \
 	python -m pytest -q -m real_time $(PYTEST_ARGS) $(REAL_TIME); real_time=$$?; \
 	case $$others$$real_time in 00|05|50) ;; *) exit 1 ;; esac
 
 # The inner loop: style, imports, and the unit tests that are over quickly.
 check: build
 	@. tools/env.sh && export ROS_PYTHON_CHECK_FIELDS=1; $(KEEP_COMPILED); ruff check && ruff format --check -q && \
-	$(ONE_THREAD) python -m pytest -q -n 2 --dist loadgroup -m "not slow and not long and not real_time" $(PYTEST_ARGS) \
+	$(ONE_THREAD) python -m pytest -q $(TWO) -m "not slow and not long and not real_time" $(PYTEST_ARGS) \
 	$(wildcard src/*/test) tests/test_architecture.py
 
 # After a change of a version in requirements/: the hashes that pip compares with what it downloads. Needs the network, and

@@ -174,4 +174,6 @@ def again(kind, seed, number):
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from flexarm_ros.start import leave_after
+
+    leave_after(lambda: sys.exit(main()))
