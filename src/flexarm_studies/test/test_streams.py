@@ -85,6 +85,14 @@ def test_repeated_and_late_samples_are_left_out():
             lambda: [streams.of_joints("j", np.arange(99.0), ["a"], strain=np.zeros((99, 1)))],
             "none of joints",
         ),
+        (  # the slope at the end is more than a number of 64 bits
+            lambda: [
+                streams.of_joints(
+                    "j", 0.01 * np.arange(22), ["a"], position=4.5e305 * np.eye(22)[:, 21:]
+                )
+            ],
+            "j: position.* changes by too much between samples.*remove",
+        ),
     ],
 )
 def test_what_can_not_be_joined_is_refused_by_name(made, message):

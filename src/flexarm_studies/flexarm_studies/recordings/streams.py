@@ -4,6 +4,7 @@
 Between samples, a cubic through the four samples around is used. A gap in any signal is a gap of the recording.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,7 +50,8 @@ def join(streams):
     Raises
     ------
     FlexarmError
-        For a stream that is too short, whose values are not finite, or that has no time in common with the others.
+        For a stream that is too short, whose values are not finite or change by more than can be computed with, or
+        that has no time in common with the others.
     """
     cleaned = [_ascending(stream) for stream in streams]
     if not cleaned:
@@ -71,9 +73,7 @@ def join(streams):
     for stream, own in zip(cleaned, periods, strict=True):
         keep &= _covered(stream.time, own, grid)
         for quantity, values in stream.signals.items():
-            made.setdefault(quantity, []).append(
-                Akima1DInterpolator(stream.time, values, axis=0)(grid)
-            )
+            made.setdefault(quantity, []).append(_at(grid, stream, quantity, values))
         for kind, of in stream.names.items():
             names.setdefault(kind, []).extend(of)
     if len(cleaned) > 1:
@@ -83,6 +83,18 @@ def join(streams):
     signals.setdefault("strain", np.zeros((int(keep.sum()), 0)))
     found = uniform(grid[keep], signals, **{f"{k}_names": tuple(v) for k, v in names.items()})
     return replace(found, notes=(*notes, *found.notes))
+
+
+def _at(grid, stream, quantity, values):
+    """The `values` of a stream's quantity, interpolated at the times of a grid."""
+    found = np.full(1, np.nan)
+    with np.errstate(all="ignore"), suppress(ValueError):  # raised if a slope is not finite
+        found = Akima1DInterpolator(stream.time, values, axis=0)(grid)
+    if not np.isfinite(found).all():
+        field = f"{stream.name}: {quantity}"
+        hint = "remove the samples that no sensor can have measured"
+        raise FlexarmError("changes by too much between samples", field=field, hint=hint)
+    return found
 
 
 def _ascending(stream):
