@@ -36,6 +36,24 @@ ERRORS = [
             "self._error",
         ),
         (
+            "joint_pid",
+            "the integral grows by friction's torque, too",
+            "opposes = step * self.integral < 0.0",
+            "opposes = step * self.integral != 0.0",
+        ),
+        (
+            "joint_pid",
+            "friction's torque takes the integral beyond zero",
+            "where=np.abs(step) > np.abs(self.integral)",
+            "where=np.abs(step) > np.inf",
+        ),
+        (
+            "joint_pid",
+            "the integral shrinks while the joint slides",
+            "np.subtract(1.0, pushed, out=pushed)",
+            "pushed[:] = 1.0",
+        ),
+        (
             "resolved_acceleration",
             "null space: missing",
             "return y + self.damped_inverse(J) @ (b - J @ y)",

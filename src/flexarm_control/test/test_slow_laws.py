@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from flexarm_control.component import at_rest
 from flexarm_control.composite.design import SLOW, design, design_law
 from flexarm_control.motions import profiles
+from flexarm_control.slow.joint_pid import JointPid
 from flexarm_control.slow.payload_model import PayloadModel
 from flexarm_control.slow.rigid_arm import Tip, rigid_arm
 from flexarm_dynamics import registry
@@ -759,12 +760,15 @@ def test_joint_pids_integral_ends_at_its_limit_and_waits_while_the_torque_is_bey
     assert_allclose(law.integral, [0.05, -0.05], rtol=1e-12)
 
 
+def rough(plant, viscous=0.1, coulomb=0.5):
+    """The same arm with friction in each joint."""
+    friction = Friction(viscous=viscous, coulomb=coulomb, smoothing=0.02)
+    joints = tuple(replace(j, friction=friction) for j in plant.arm.joints)
+    return model.build(replace(plant.arm, joints=joints))
+
+
 def test_joint_pid_cancels_a_part_of_the_friction_that_its_motion_does_not_have(two_link):
-    friction = Friction(viscous=0.1, coulomb=0.5, smoothing=0.02)
-    rough = replace(
-        two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
-    )
-    law = law_of("joint_pid", model.build(rough), friction=[0.8, 0.4], bandwidth=50.0)
+    law = law_of("joint_pid", rough(two_link), friction=[0.8, 0.4], bandwidth=50.0)
     still, ref = np.zeros(2), reference([0.0, 0.0], [0.3, -0.01])
     law.feedback(still, still, at_rest(still))
     law.advance(1e-3)  # the low pass is not on its way
@@ -778,11 +782,7 @@ def test_joint_pid_cancels_a_part_of_the_friction_that_its_motion_does_not_have(
 
 
 def test_joint_pid_pushes_a_joint_that_sticks_beside_its_place_back(two_link):
-    friction = Friction(viscous=0.1, coulomb=0.5, smoothing=0.02)
-    rough = replace(
-        two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
-    )
-    law = law_of("joint_pid", model.build(rough), friction=[0.8], return_rate=5.0)
+    law = law_of("joint_pid", rough(two_link), friction=[0.8], return_rate=5.0)
     q, still, ref = np.array([0.002, -10.0]), np.zeros(2), reference([0.0, 0.0], [0.0, 0.0])
     wanted = 0.8 * 0.5 * np.array([np.tanh(-0.01 / 0.02), 1.0])  # never more than is cancelled
     assert_allclose(law.feedback(q, still, ref), wanted, rtol=1e-12)
@@ -791,13 +791,9 @@ def test_joint_pid_pushes_a_joint_that_sticks_beside_its_place_back(two_link):
 
 
 def test_joint_pid_overcomes_the_rest_of_the_friction_by_the_error_alone(two_link):
-    friction = Friction(viscous=0.1, coulomb=0.5, smoothing=0.02)
-    rough = replace(
-        two_link.arm, joints=tuple(replace(j, friction=friction) for j in two_link.arm.joints)
-    )
     parts = {"friction": [0.8, 0.1], "breakaway": [0.95, 0.95], "breakaway_rate": 5.0}
-    law = law_of("joint_pid", model.build(rough), **parts)
-    plain = law_of("joint_pid", model.build(rough), friction=[0.8, 0.1])
+    law = law_of("joint_pid", rough(two_link), **parts)
+    plain = law_of("joint_pid", rough(two_link), friction=[0.8, 0.1])
     q, ref = np.array([0.002, -10.0]), reference([0.0, 0.0], [0.0, 0.0])
     wanted = 0.5 * np.array([0.15 * np.tanh(-0.01 / 0.02), 0.85])
     for speed in (0.0, 0.3):  # whatever the joint's own speed is
@@ -808,6 +804,63 @@ def test_joint_pid_overcomes_the_rest_of_the_friction_by_the_error_alone(two_lin
     assert_allclose(law.feedback(q, there.velocity, there), [0.0, 0.0], atol=1e-12)
     with law.without_friction(), plain.without_friction():
         assert_allclose(law.feedback(q, qd, ref), plain.feedback(q, qd, ref), rtol=0.0)
+
+
+@pytest.mark.parametrize("friction", [0.8, 0.0])
+def test_joint_pids_integral_shrinks_where_friction_torque_on_a_joint_that_stands_opposes_it(
+    two_link, friction
+):
+    gains = {"stiffness": [5.0, 8.0], "integral": [2.0, 3.0]}
+    parts = {"friction": [friction], "return_rate": 5.0, "breakaway": [0.95], "breakaway_rate": 7.0}
+    law = law_of("joint_pid", rough(two_link), **gains, **parts)
+    error, qd, dt = np.array([0.002, -0.003]), np.array([0.004, -0.009]), 1e-3
+    pushed = 0.5 * friction * np.tanh((qd + 5.0 * error) / 0.02)
+    pushed += 0.5 * (0.95 - friction) * np.tanh(7.0 * error / 0.02)
+    pushed *= 1.0 - np.tanh(qd / 0.02) ** 2
+    for signs in ([-1, 1], [1, -1], [-1, -1]):
+        law.reset()
+        start = law.absorb(np.array(signs) * [0.3, 0.4]).copy()
+        law.feedback(-error, qd, reference([0.0, 0.0]))
+        law.advance(dt)
+        effective = error + np.where(start * pushed < 0.0, pushed / [5.0, 8.0], 0.0)
+        assert_allclose(law.integral, start + dt * np.array([2.0, 3.0]) * effective, rtol=1e-12)
+    sliding = np.array([0.4, -0.4])
+    law.reset()
+    law.absorb(np.array([-0.3, -0.4]))
+    law.feedback(np.zeros(2), sliding, reference([0.0, 0.0], sliding))
+    law.advance(dt)
+    assert_allclose(law.integral, [-0.3, -0.4], rtol=1e-12)
+
+
+def test_friction_torque_takes_joint_pids_integral_no_further_than_to_zero(two_link):
+    gains, parts = (
+        {"stiffness": [5.0], "integral": [2.0]},
+        {"breakaway": [0.95], "breakaway_rate": 7.0},
+    )
+    law, still, error = law_of("joint_pid", rough(two_link), **gains, **parts), np.zeros(2), 0.002
+    law.absorb(np.array([-1e-6, -0.4]))
+    law.feedback(still - error, still, reference([0.0, 0.0]))
+    law.advance(0.1)
+    assert_allclose(law.integral[0], 0.1 * 2.0 * error, rtol=1e-12)
+    assert -0.4 + 0.1 * 2.0 * error < law.integral[1] < 0.0
+
+
+@pytest.mark.parametrize("true", [0.7, 1.0, 1.3])
+def test_a_joint_that_sticks_beside_its_place_gets_there_sooner_as_the_integral_shrinks(
+    rigid, monkeypatch, true
+):
+    gains = {"stiffness": [20.0], "damping": [8.0], "integral": [20.0]}
+    parts = {"friction": [0.8], "return_rate": 10.0, "breakaway": [0.95], "breakaway_rate": 10.0}
+
+    def after_a_motion():
+        law = law_of("joint_pid", rough(rigid), **gains, **parts)
+        law.absorb(np.array([-0.4, -0.4]))  # what the motion has left
+        plant = rough(rigid, coulomb=0.5 * true)
+        return np.abs(settled(law, plant, 2.0, np.array([0.3, 0.2]), 1e-3)).max()
+
+    error = after_a_motion()
+    monkeypatch.setattr(JointPid, "_shrink", lambda law, dt: None)
+    assert error < 0.2 * after_a_motion()
 
 
 @pytest.mark.parametrize("bandwidth", [0.0, 50.0])

@@ -37,6 +37,15 @@ The friction itself damps this loop: if the torque acts as a stiffness k at some
 the friction acts there as a damper of at least :math:`k/\omega`. Linear loops are judged without these two torques;
 `flexarm design` also has loops of joints that stick, with both (`robust.loop`).
 
+Where a joint sticks, these two torques hold it like a spring many times as stiff as :math:`K_q`. Then what a motion
+leaves in the integral is removed only slowly, and the joint rests where this spring balances it. So where the torque on
+a joint that stands opposes its integral, the integral shrinks as by the error for which :math:`K_q` gives this torque:
+
+.. math:: \dot w = K_w\,(e + u_s/K_q) \;\text{ where } u_s w < 0, \qquad
+    u_s = (u_f + u_b)\,[1 - \tanh^2(\dot q/v_0)] ,
+
+and :math:`u_s` alone takes it no further than zero. A joint that slides has no :math:`u_s`.
+
 There may be several sets of gains, each designed for its own configuration (`flexarm_control.schedule`). w is a torque,
 not an angle, so a change of K_w does not change w.
 """
@@ -119,7 +128,7 @@ class JointPid(SlowLaw):
         rates = self.parameters["return_rate"], self.parameters["breakaway_rate"]
         self._rates = np.array(rates)[:, None]
         self._cancels = some(self._cancelled) or some(self._overcome)
-        self._slides, self._more = np.zeros((3, n)), np.zeros(n)
+        self._slides, self._more, self._pushed = np.zeros((4, n)), np.zeros(n), np.zeros(n)
 
     @contextmanager
     def without_friction(self):
@@ -146,7 +155,7 @@ class JointPid(SlowLaw):
 
     def reset(self):
         self._low_pass.reset()
-        for state in (self.integral, self._error, self._beyond):
+        for state in (self.integral, self._error, self._beyond, self._pushed):
             state[:] = 0.0
 
     def resume(self, other):
@@ -159,8 +168,20 @@ class JointPid(SlowLaw):
         self._low_pass.advance(dt)
         # Where the torque is beyond its limit, an error that pushes further is not integrated.
         grows = np.where(self._beyond * self._error > 0.0, 0.0, self._error)
+        if self._cancels:
+            self._shrink(dt)
         self.integral += dt * self.gain * grows
         np.clip(self.integral, -self._most, self._most, out=self.integral)
+
+    def _shrink(self, dt):
+        """Let the integral shrink, at most to zero, where the friction torque u_s of the last sample opposes it."""
+        step = np.zeros_like(self.integral)
+        np.divide(
+            dt * self.gain * self._pushed, self.stiffness, out=step, where=self.stiffness > 0.0
+        )
+        opposes = step * self.integral < 0.0
+        np.copyto(step, -self.integral, where=np.abs(step) > np.abs(self.integral))
+        np.add(self.integral, step, out=self.integral, where=opposes)
 
     def torque(self, q, qd, reference, terms):
         return self._on(reference) + self.feedback(q, qd, reference)
@@ -180,19 +201,23 @@ class JointPid(SlowLaw):
     def _friction(self, qd, expected):
         """Friction torque u_f + u_b at joint speeds qd and the present error; the motion has the `expected` speeds.
 
-        Speeds are (n,) [rad/s]; the result is (n,) [N m].
+        Speeds are (n,) [rad/s]; the result is (n,) [N m]. The part on joints that stand, u_s, is kept for the integral.
         """
-        slides, more = self._slides, self._more
+        slides, more, pushed = self._slides, self._more, self._pushed
         np.multiply(self._rates, self._error, out=slides[:2])
         slides[0] += qd
         slides[1] += expected
         slides[2] = expected
+        slides[3] = qd
         slides /= self._smoothing
         np.tanh(slides, out=slides)
         slides[:2] -= slides[2]
         np.multiply(self._cancelled, slides[0], out=more)
         slides[1] *= self._overcome
         more += slides[1]
+        np.square(slides[3], out=pushed)
+        np.subtract(1.0, pushed, out=pushed)
+        pushed *= more
         return more
 
     def absorb(self, torque):
