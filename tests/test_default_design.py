@@ -5,6 +5,7 @@ import signal
 import threading
 from collections import deque
 
+import numpy as np
 import pytest
 from in_process import InProcess
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -18,6 +19,7 @@ from flexarm_dynamics.arm import arm_file
 from flexarm_ros.node import WARN
 from flexarm_studies.loop.closed_loop import TRAJECTORY_START_NS
 from flexarm_studies.random_arms import generator
+from flexarm_tools.recording import recorder
 from flexarm_tools.running import lockstep
 
 #: A design that is quickly made.
@@ -104,20 +106,48 @@ def test_each_parameter_given_by_hand_stays_and_a_design_is_made_once(path, no_d
         assert nodes.nodes["damped"].core.law.slow.parameters["damping"] == [3.0]
 
 
+def delayed(nodes, path, periods, noise=False, **control):
+    """Start simulator, observer and controller; each torque comes so many periods late."""
+    nodes.start("simulator", {"arm": path, "rate": 500.0, "lockstep": True, "noise": noise})
+    sim = nodes.nodes["simulator"].sim
+    advance, way = sim.advance, deque([None] * periods)
+
+    def late(torque):
+        way.append(None if torque is None else torque.copy())
+        advance(way.popleft())
+
+    sim.advance = late
+    nodes.start("observer", {"arm": path, **QUICK})
+    nodes.start("controller", {"arm": path, **QUICK, **PATIENT, **control})
+
+
+def test_with_noise_the_delay_is_measured_and_the_arm_is_on_its_motion_in_time(path):
+    joints, profile = arm_file.load(path).joint_names, profiles.quintic(0.0, 0.8, 0.5)
+    begin = TRAJECTORY_START_NS + 300_000_000  # the noise at rest is enough to measure the delay
+    message = lockstep.trajectory_message(joints, profile, 51, begin)
+    cases = {
+        "at once": (0, False, {}),
+        "known": (1, True, {}),
+        "left out": (1, True, {"motion_delay": 0.0}),
+    }
+    position = {}
+    for name, (periods, noise, own) in cases.items():
+        with InProcess() as nodes:
+            delayed(nodes, path, periods, noise, **own)
+            samples = nodes.record(message, 1.2)
+            values = nodes.nodes["controller"].diagnose()[2]
+        assert values["torque delay p50 [ms]"] == f"{2 * periods:.3f}"
+        position[name] = recorder.to_record(samples, begin, path).position
+    known, left_out = (
+        np.abs(position[name] - position["at once"]).max() for name in ("known", "left out")
+    )
+    assert known < 0.1 * left_out
+
+
 @pytest.mark.parametrize("periods", [0, 2, 8])
 def test_the_delay_of_the_loop_is_measured_and_compared_with_what_the_design_bears(path, periods):
     with InProcess() as nodes:
-        nodes.start("simulator", {"arm": path, "rate": 500.0, "lockstep": True})
-        sim = nodes.nodes["simulator"].sim
-        advance, way = sim.advance, deque([None] * periods)
-
-        def late(torque):
-            way.append(None if torque is None else torque.copy())
-            advance(way.popleft())
-
-        sim.advance = late
-        nodes.start("observer", {"arm": path, **QUICK})
-        nodes.start("controller", {"arm": path, **QUICK, **PATIENT})
+        delayed(nodes, path, periods)
         bears = nodes.nodes["controller"].design.bears_delay
         assert 0.004 < bears < 0.016
         profile = profiles.quintic(0.0, 0.1, 0.5)
