@@ -362,6 +362,12 @@ ERRORS = [
         ),
         (
             "planner",
+            "modes that no torque reaches: the model's own arm counts like the others",
+            "weight = QUIET * (OWN if arm is self else 1.0)",
+            "weight = QUIET",
+        ),
+        (
+            "planner",
             "modes that no torque reaches: brought to rest at the model's frequency, like the others",
             "self.driven = coupling[:slow] > UNDRIVEN * coupling.max(initial=0.0)",
             "self.driven = coupling[:slow] >= 0.0",

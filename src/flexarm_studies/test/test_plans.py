@@ -246,6 +246,8 @@ def test_a_plan_leaves_little_in_a_mode_that_no_torque_reaches(number, payload, 
     plan, (_, real) = plan_of(number, 0.15), planners(number, 0.0, payload, stiffness)
     assert (np.abs(plan.torque) <= real.limit).all()
     assert left_across(plan, real) < 4e-4
+    if payload == stiffness == 1.0:
+        assert left_across(plan, real) < 3e-5
     if payload > 1.0:
         assert left_across(plan_of(number, 0.0), real) > 2.0 * left_across(plan, real)
 

@@ -28,8 +28,8 @@ reaches them, and no control damps them after the motion. Yet the motion excites
 the centrifugal force lifts it, and this force goes with the squares of the joints' speeds. So the shift also determines
 what the motion leaves in such a mode. Let :math:`r_v` be the amplitude of the tip, over the reach, and its rate over
 the mode's frequency. The shift makes these small for arms v whose frequencies are up to `Settings.spread` higher or
-lower, because the arm's payload is not known exactly. If there is no such shift within the torque limit, these modes
-are left as they are.
+lower, because the arm's payload is not known exactly. The model's own arm has the largest weight. If there is no such
+shift within the torque limit, these modes are left as they are.
 """
 
 from dataclasses import dataclass, replace
@@ -84,8 +84,9 @@ UNDRIVEN, UNMOVED = 1e-6, 1e-2
 #: Smallest force that counts as one.
 TINY = 1e-300
 #: What is left of modes that are not brought to rest is made small at these fractions of the spread of frequencies [-],
-#: and with this weight on the amplitude of the tip over the reach, relative to the shift: rho [rad].
-SPREADS, QUIET = (-1.0, -0.5, 0.5, 1.0), 100.0
+#: and with this weight on the amplitude of the tip over the reach, relative to the shift: rho [rad]. For the model's
+#: own arm the weight is this many times as large.
+SPREADS, QUIET, OWN = (-1.0, -0.5, 0.5, 1.0), 100.0, 10.0
 #: The plan's step is at most this fraction of the step of `STEPS_PER_PERIOD`, or one step of the integration [-].
 PLANNED = 0.25
 #: A motion of more steps is not planned.
@@ -447,7 +448,8 @@ class Planner:
             ends.append((other, x[-1], v[-1]))
         for arm, *end in ends:
             which = np.tile(arm.excited, 2)
-            factor = QUIET * np.concatenate([arm.shown, arm.shown / arm.planned])[which]
+            weight = QUIET * (OWN if arm is self else 1.0)
+            factor = weight * np.concatenate([arm.shown, arm.shown / arm.planned])[which]
             rows = np.vstack([rows, factor[:, None] * arm.bends[which]])
             values = np.append(values, -factor * arm._left(*end)[which])
         return rows, values
