@@ -54,6 +54,12 @@ ERRORS = [
             "pushed[:] = 1.0",
         ),
         (
+            "joint_pid",
+            "friction's torque is not averaged",
+            "mean += (1.0 - math.exp(-dt * self._rates.max())) * (self._pushed - mean)",
+            "mean[:] = self._pushed",
+        ),
+        (
             "resolved_acceleration",
             "null space: missing",
             "return y + self.damped_inverse(J) @ (b - J @ y)",

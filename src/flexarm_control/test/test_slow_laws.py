@@ -822,7 +822,8 @@ def test_joint_pids_integral_shrinks_where_friction_torque_on_a_joint_that_stand
         start = law.absorb(np.array(signs) * [0.3, 0.4]).copy()
         law.feedback(-error, qd, reference([0.0, 0.0]))
         law.advance(dt)
-        effective = error + np.where(start * pushed < 0.0, pushed / [5.0, 8.0], 0.0)
+        mean = (1.0 - np.exp(-7.0 * dt)) * pushed
+        effective = error + np.where(start * mean < 0.0, mean / [5.0, 8.0], 0.0)
         assert_allclose(law.integral, start + dt * np.array([2.0, 3.0]) * effective, rtol=1e-12)
     sliding = np.array([0.4, -0.4])
     law.reset()

@@ -41,15 +41,18 @@ Where a joint sticks, these two torques hold it like a spring many times as stif
 leaves in the integral is removed only slowly, and the joint rests where this spring balances it. So where the torque on
 a joint that stands opposes its integral, the integral shrinks as by the error for which :math:`K_q` gives this torque:
 
-.. math:: \dot w = K_w\,(e + u_s/K_q) \;\text{ where } u_s w < 0, \qquad
+.. math:: \dot w = K_w\,(e + m/K_q) \;\text{ where } m w < 0, \qquad \dot m = \lambda_m (u_s - m), \qquad
     u_s = (u_f + u_b)\,[1 - \tanh^2(\dot q/v_0)] ,
 
-and :math:`u_s` alone takes it no further than zero. A joint that slides has no :math:`u_s`.
+and m alone takes it no further than zero. A joint that slides has no :math:`u_s`. Here m is a mean, and
+:math:`\lambda_m` is the larger one of :math:`\lambda` and :math:`\lambda_\beta`. If links shake the joint, half of each
+vibration opposes the integral. Without the mean, the integral would shrink below what the weight needs.
 
 There may be several sets of gains, each designed for its own configuration (`flexarm_control.schedule`). w is a torque,
 not an angle, so a change of K_w does not change w.
 """
 
+import math
 from contextlib import contextmanager
 
 import numpy as np
@@ -128,7 +131,8 @@ class JointPid(SlowLaw):
         rates = self.parameters["return_rate"], self.parameters["breakaway_rate"]
         self._rates = np.array(rates)[:, None]
         self._cancels = some(self._cancelled) or some(self._overcome)
-        self._slides, self._more, self._pushed = np.zeros((4, n)), np.zeros(n), np.zeros(n)
+        self._slides, self._more = np.zeros((4, n)), np.zeros(n)
+        self._pushed, self._mean = np.zeros(n), np.zeros(n)  # u_s and m
 
     @contextmanager
     def without_friction(self):
@@ -155,7 +159,7 @@ class JointPid(SlowLaw):
 
     def reset(self):
         self._low_pass.reset()
-        for state in (self.integral, self._error, self._beyond, self._pushed):
+        for state in (self.integral, self._error, self._beyond, self._pushed, self._mean):
             state[:] = 0.0
 
     def resume(self, other):
@@ -174,11 +178,10 @@ class JointPid(SlowLaw):
         np.clip(self.integral, -self._most, self._most, out=self.integral)
 
     def _shrink(self, dt):
-        """Let the integral shrink, at most to zero, where the friction torque u_s of the last sample opposes it."""
-        step = np.zeros_like(self.integral)
-        np.divide(
-            dt * self.gain * self._pushed, self.stiffness, out=step, where=self.stiffness > 0.0
-        )
+        """Let the integral shrink, at most to zero, where the mean m of the friction torque u_s opposes it."""
+        mean, step = self._mean, np.zeros_like(self._mean)
+        mean += (1.0 - math.exp(-dt * self._rates.max())) * (self._pushed - mean)
+        np.divide(dt * self.gain * mean, self.stiffness, out=step, where=self.stiffness > 0.0)
         opposes = step * self.integral < 0.0
         np.copyto(step, -self.integral, where=np.abs(step) > np.abs(self.integral))
         np.add(self.integral, step, out=self.integral, where=opposes)
