@@ -116,12 +116,13 @@ COMPARE_OUT := --json docs/comparison.json --write docs/comparison.md
 compare: build
 	@. tools/env.sh && python -m flexarm_bringup.cli compare $(if $(COMPARE_ARGS),$(COMPARE_ARGS),$(COMPARE_OUT))
 
-# The table of docs/random_arms.md, of a whole run alone. Every run is kept, those of a whole run in docs: after a change
-# of the code `make arms FRESH=1` starts anew. CONTROLLERS=default,designed runs some alone.
+# The table of docs/random_arms.md, of a whole run alone. Every design and run is kept, those of a whole run in docs: after
+# a change of the code `make arms FRESH=1` starts anew. CONTROLLERS=default,designed runs some alone.
 ARMS_WHOLE := $(filter 100-0-,$(COUNT)-$(SEED)-$(CONTROLLERS))
 arms: build
 	@mkdir -p results && . tools/env.sh && python -m flexarm_bringup.cli arms --count $(COUNT) --seed $(SEED) \
 	--out $(if $(ARMS_WHOLE),docs/random_arms.jsonl,results/random_arms_$(SEED).jsonl) \
+	--designs $(if $(ARMS_WHOLE),docs/random_arms_designs.jsonl,results/random_arms_$(SEED)_designs.jsonl) \
 	$(if $(FRESH),--fresh) $(if $(WORKERS),--workers $(WORKERS)) \
 	$(if $(CONTROLLERS),--controllers $(CONTROLLERS)) $(if $(ARMS_WHOLE),--write docs/random_arms.md)
 

@@ -11,10 +11,11 @@ import yaml
 from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control
+from flexarm_control.robust.default import Default
 from flexarm_control.robust.design import Settings, design
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
-from flexarm_dynamics.errors import FlexarmError
+from flexarm_dynamics.errors import DesignError, FlexarmError
 from flexarm_dynamics.models import model
 from flexarm_dynamics.models.fixed_step import substeps
 from flexarm_studies.random_arms import command, generator, report, study
@@ -280,6 +281,48 @@ def test_runs_are_kept_and_not_run_again(tmp_path, monkeypatch):
     assert len(calls) == 5
     with pytest.raises(FlexarmError, match="another specification"):
         study.run(6, *args[1:])
+
+
+def test_designs_of_a_file_are_run_and_missing_ones_made_and_added(tmp_path, monkeypatch):
+    made, ran = [], []
+
+    def design_of(case):
+        made.append(case.name)
+        if case.name.endswith("_1"):
+            raise DesignError("has no stable gains", field="controller of it")
+        return Default({"slow.stiffness": [7.0]}, 0.002, 0.01, 0.4, 1.0, False, True)
+
+    def run(case, setup, variant, seed):
+        ran.append((case.name, setup.controller["feedforward"], setup.controller["slow.stiffness"]))
+        return {"lost": "why not"}
+
+    monkeypatch.setattr(study, "design_of", design_of)
+    monkeypatch.setattr(trial, "run", run)
+    path = tmp_path / "designs.jsonl"
+
+    def runs(numbers):
+        both = ["designed", "designed_preview"]
+        return study.run(5, numbers, both, ["exact"], workers=1, designs=path)
+
+    first, second, refused, _ = runs([0, 1])
+    name = generator.arm(0, seed=5).name
+    assert ran == [(name, "model", [7.0]), (name, "preview", [7.0])]
+    assert first["decay"] == second["decay"] == 0.4
+    assert refused["refused"] == "controller of it: has no stable gains"
+    # A changed line of the file is what runs; only the arm that is not in it gets a design.
+    path.write_text(path.read_text().replace("7.0", "8.0"))
+    runs([0, 2])
+    assert ran[2] == (name, "model", [8.0]) and ran[-1][2] == [7.0]
+    assert made == [generator.arm(n, seed=5).name for n in (0, 1, 2)]
+    # Another seed has other arms, and a file of runs is none of designs.
+    with pytest.raises(FlexarmError, match="another specification"):
+        study.run(6, [0], ["designed"], ["exact"], workers=1, designs=path)
+    path.write_text(path.read_text().replace("parameters", "gains"))
+    with pytest.raises(FlexarmError, match="not a file of designs"):
+        runs([0])
+    # Controllers that have no design make none.
+    study.run(5, [3], ["pid_zvd"], [], workers=1, designs=tmp_path / "none.jsonl")
+    assert len(made) == 3
 
 
 def row(number, controller, settling, **more):

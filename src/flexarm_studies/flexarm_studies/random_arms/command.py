@@ -34,7 +34,8 @@ def add_arguments(parser):
         "examples:\n"
         "  flexarm arms --count 8 --controllers default,pid_zvd --variants 'exact,payload x1.3'\n"
         "  flexarm arms --count 16 --files results/arms\n"
-        "  flexarm arms --arms 0-4,8 --controllers designed_preview --out results/arms.jsonl"
+        "  flexarm arms --arms 0-4,8 --controllers designed_preview --out results/arms.jsonl\n"
+        "  flexarm arms --arms 0-4,8 --controllers designed_preview --designs docs/random_arms_designs.jsonl"
     )
     add = parser.add_argument
     which = parser.add_mutually_exclusive_group()
@@ -55,7 +56,12 @@ def add_arguments(parser):
         metavar="FILE.jsonl",
         help="write every run; runs that are in it are not run again, so an interrupted command goes on",
     )
-    add("--fresh", action="store_true", help="remove that file first: after a change of the code")
+    add(
+        "--designs",
+        metavar="FILE.jsonl",
+        help="designed controllers have the gains of this file; those that it lacks are searched for and added to it",
+    )
+    add("--fresh", action="store_true", help="remove these files first: after a change of the code")
     add(
         "--write", metavar="FILE.md", help="write the table between the seed's markers of this file"
     )
@@ -76,8 +82,9 @@ def arms(options):
         return
     controllers = chosen("--controllers", options.controllers, CONTROLLERS)
     variants = chosen("--variants", options.variants, VARIANTS)
-    if options.out and options.fresh:
-        Path(options.out).unlink(missing_ok=True)
+    for path in (options.out, options.designs):
+        if path and options.fresh:
+            Path(path).unlink(missing_ok=True)
     progress = Progress()
     rows = study.run(
         options.seed,
@@ -88,6 +95,7 @@ def arms(options):
         options.workers,
         progress,
         options.scheduler,
+        options.designs,
     )
     progress.done()
     if options.write:

@@ -24,20 +24,35 @@ def _tutorial(feedforward, case):
     return Setup(scenarios.parameters("composite", settings))
 
 
-def _designed(feedforward, case):
-    """`Setup` of the arm's design, which is taken from the cache of designs if it is there."""
+def design_of(case):
+    """The `Default` of the arm's design, which is taken from the cache of designs if it is there.
+
+    Raises
+    ------
+    DesignError
+        If no stable gains are found.
+    """
     start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
     settings = Settings(rate=RATE, delay=DELAY, configurations=(middle, start, end))
-    found = default(case.read(), settings, Uncertainty())
-    parameters = found.parameters | {"feedforward": feedforward, "rate": RATE}
-    return Setup(parameters, found={"decay": found.reached})
+    return default(case.read(), settings, Uncertainty())
 
 
+def with_design(controller, design):
+    """`Setup` of a controller of `DESIGNED` with a `Default`."""
+    parameters = design.parameters | {"feedforward": DESIGNED[controller], "rate": RATE}
+    return Setup(parameters, found={"decay": design.reached})
+
+
+def _designed(controller, case):
+    return with_design(controller, design_of(case))
+
+
+#: Controllers with the gains of `flexarm design`, and their feed-forward.
+DESIGNED = {"designed": "model", "designed_preview": "preview"}
 CONTROLLERS = {
     "default": partial(_tutorial, "model"),
     "preview": partial(_tutorial, "preview"),
-    "designed": partial(_designed, "model"),
-    "designed_preview": partial(_designed, "preview"),
+    **{name: partial(_designed, name) for name in DESIGNED},
     "pid": partial(shaped_pid, kind=None),
     "pid_zv": partial(shaped_pid, kind="zv"),
     "pid_zvd": partial(shaped_pid, kind="zvd"),
