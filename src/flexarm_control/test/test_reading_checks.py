@@ -429,6 +429,34 @@ def test_joint_is_light_if_it_is_so_in_one_configuration():
     assert not Channels(model, None).heavy
 
 
+@pytest.mark.parametrize(("name", "least"), [("R", 0.95), ("tapered", 0.5)])
+def test_a_step_of_the_torque_accelerates_no_strain_beyond_its_bound_while_the_modes_turn(
+    name, least
+):
+    arm = scaled(arm_file.load(name), damping=0.0)
+    model = models.build(arm)
+    map_, n, m = StrainMap(model), model.n_joints, model.n_modes
+    c, q = Channels(model, map_), np.zeros(n)
+    M = model.terms(q, q).M
+    force = np.eye(n + m)[:, 0]
+    K = np.zeros_like(M)
+    K[n:, n:] = model.stiffness_matrix()
+    # M x'' + K x = e_1 from rest: x'' = cos(Omega t) M^-1 e_1, with Omega^2 = M^-1 K.
+    at_first = np.linalg.solve(M, force)
+    squares, shapes = np.linalg.eig(np.linalg.solve(M, K))
+    parts = shapes * np.linalg.solve(shapes, at_first)
+    omega = np.sqrt(np.abs(squares))
+    times = np.linspace(0.0, 20.0 * np.pi / omega[omega > 1.0].min(), 20000)
+    bent = (parts @ np.cos(np.outer(omega, times)))[n:]
+    for readings_, rows in ((bent, c.amplitude), (map_.rows @ bent, c.strain)):
+        largest = np.abs(readings_).max(axis=1)
+        bound = 0.5 * c.gain[rows, 0]
+        assert np.all(largest < bound * 1.001)
+        assert np.all(largest > least * bound)  # it is not much looser than that
+    # The gauge in the middle hardly feels the step itself.
+    assert abs(map_.rows @ at_first[n:])[-1] < 0.5 * np.abs(map_.rows @ bent)[-1].max()
+
+
 @pytest.mark.parametrize(("step", "found"), [(0.0, True), (0.1, False)])
 def test_steps_of_the_torque_swing_a_light_joint_between_samples_that_see_it_at_rest(step, found):
     model = models.build(arm_file.load("two_link"))

@@ -8,7 +8,16 @@ strain map, a step :math:`\Delta u` of the torque changes the accelerations by
 .. math:: |\Delta\ddot q| \le 2|H_{11}||\Delta u|, \qquad |\Delta\ddot\delta| \le 2|H_{21}||\Delta u|, \qquad
           |\Delta\ddot\varepsilon| \le 2|R H_{21}||\Delta u| ,
 
-where the 2 allows for errors of the model. The end of a light link has hardly any inertia of its own. A motor on it is
+where the 2 allows for errors of the model. The step goes on to act on the deflections while the modes turn. For a gauge
+in the middle of a link the modes' parts of :math:`R H_{21}` may cancel at first. A part of a period later they add up.
+So the bounds of strains and deflections are at least twice the sum of all parts,
+
+.. math:: |\Delta\ddot\delta_i| \le 2\sum_k |\phi_{k,i}|\,|\phi_{k,1}|^T|\Delta u|, \qquad
+          |\Delta\ddot\varepsilon_i| \le 2\sum_k |R_i\phi_{k,2}|\,|\phi_{k,1}|^T|\Delta u| ,
+
+with the normal modes :math:`\phi_k` of unit modal mass, their joints' part 1 and their deflections' part 2.
+
+The end of a light link has hardly any inertia of its own. A motor on it is
 therefore turned back by modes that the arm file leaves out. Gauges feel these modes, too. So for an arm with a light
 joint the bounds for joints and gauges are also computed in a second way: with one more mode in every direction and,
 instead of H, with the mean acceleration that a constant torque causes over a time t:
@@ -16,7 +25,7 @@ instead of H, with the mean acceleration that a constant torque causes over a ti
 .. math:: \bar H = \begin{pmatrix} M_{11}^{-1} & 0 \\ 0 & 0 \end{pmatrix}
           + \sum_k s_k^2\,\phi_k\phi_k^T , \qquad s_k = \frac{\sin(\omega_k t/2)}{\omega_k t/2}
 
-with the normal modes :math:`\phi_k` of unit modal mass and their frequencies :math:`\omega_k`. So positions move by
+with the frequencies :math:`\omega_k` of the modes. So positions move by
 :math:`\tfrac12 t^2\bar H\Delta u` in the time t. Velocities change in half of that time by
 :math:`\tfrac12 t\bar H\Delta u` with s_k instead of its square. The larger of the two bounds holds. Without the average
 the sum would grow with each mode; with it, it converges. The time t fits sampling at up to 1000 samples per second.
@@ -153,6 +162,12 @@ class Channels:
             soft = [0.05 * part @ strength for part in (strains, bends)]
             hard = 2.0 * _largest(rigid) @ strength
             push = np.concatenate([hard, *soft, hard, soft[1]])
+        if self.m:
+            modes = [model.normal_modes(q)[1] for q in places]
+            bends = np.maximum(bends, _largest([added_up(one, one[n:]) for one in modes]))
+            if strain_map is not None:
+                shown = [added_up(one, strain_map.rows @ one[n:]) for one in modes]
+                strains = np.maximum(strains, _largest(shown))
         speeds, rates = joints, bends
         if not self.heavy:
             fuller, gauges = model.fuller(model.arm.most_modes + 1), model.arm.gauges
@@ -184,6 +199,20 @@ class Channels:
 def _largest(arrays):
     """Largest magnitude of each element."""
     return np.abs(arrays).max(axis=0)
+
+
+def added_up(shapes, parts):
+    """Largest accelerations of readings after a step of the torques, per torque, (g, n), if all modes' parts add up.
+
+    Parameters
+    ----------
+    shapes : ndarray, shape (n + m, k)
+        Normal modes of unit modal mass; k is at most m.
+    parts : ndarray, shape (g, k)
+        Reading of each mode.
+    """
+    n = len(shapes) - shapes.shape[1]
+    return np.abs(parts) @ np.abs(shapes[:n]).T
 
 
 def mean_accelerations(model, q, time, of_velocity=False):
