@@ -86,8 +86,9 @@ class Channels:
     count : ndarray, shape (n,)
         Steps of the encoders; zero where the arm file states none [rad].
     gain : ndarray, shape (N, n)
-        Magnitude of the change of acceleration per torque: `MARGIN` times the largest over the configurations. With a
-        light joint, the mean acceleration with one more mode counts if it is larger than the model's.
+        Magnitude of the change of acceleration per torque: `MARGIN` times the largest over the configurations, for
+        strains and amplitudes also while the modes turn. With a light joint, the mean acceleration with one more mode
+        counts if it is larger than the model's.
     push : ndarray, shape (N,)
         Change of acceleration by causes that are not reported; infinite if a joint has no torque limit.
     heavy : bool
