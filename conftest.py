@@ -83,6 +83,18 @@ def flexarm(capsys):
 
 
 @pytest.fixture(scope="session")
+def domain():
+    """A ROS_DOMAIN_ID of this test process alone.
+
+    FastDDS 2.14 can wait for ever in `destroy_node` if another process of the domain starts or ends just then.
+    """
+    from flexarm_tools.running.processes import own_domain
+
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture(scope="session")
 def real_arm():
     """Folder of the measured data of a real arm, which are not part of this project; the test is skipped without."""
     folder = Path(

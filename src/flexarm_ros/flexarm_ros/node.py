@@ -26,7 +26,7 @@ from rclpy.signals import SignalHandlerOptions
 from flexarm_dynamics.errors import FlexarmError
 from flexarm_dynamics.parameters import parameter
 
-from . import qos, scheduling
+from . import ending, qos, scheduling
 from .parameters import NodeParameters
 from .spin import ControlPath, spin
 
@@ -411,6 +411,7 @@ def run(node_class, args=None):
         for node in nodes:
             if node.active:
                 node.stop()
-        for node in nodes:
-            node.destroy_node()
-        rclpy.try_shutdown()
+        with ending.bounded():
+            for node in nodes:
+                node.destroy_node()
+            rclpy.try_shutdown()

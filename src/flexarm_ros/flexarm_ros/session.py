@@ -16,7 +16,7 @@ from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 
 from flexarm_dynamics.errors import FlexarmError
 
-from . import qos
+from . import ending, qos
 
 #: Loses no message even if a reader falls behind for seconds.
 DEEP = QoSProfile(
@@ -354,9 +354,10 @@ class Session:
 
     def close(self):
         """Leave the graph."""
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
+        with ending.bounded():
+            self.executor.shutdown()
+            self.node.destroy_node()
+            rclpy.try_shutdown(context=self.context)
 
     def __enter__(self):
         return self

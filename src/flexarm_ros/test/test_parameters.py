@@ -29,11 +29,11 @@ GROUPS = {"": (ARM, SWITCH, COUNT, LABELS), "slow.": (KP, GAIN), "fast.": (ALPHA
 
 
 @pytest.fixture(scope="module")
-def context():
+def context(domain):
     """A context of rclpy, on this machine only."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=101)
+    rclpy.init(context=context, domain_id=domain)
     yield context
     rclpy.try_shutdown(context=context)
 

@@ -17,11 +17,11 @@ RELIABLE, BEST_EFFORT = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST
 
 
 @pytest.fixture(scope="module")
-def publisher():
+def publisher(domain):
     """Makes a publisher of /t, with overrides of its policies."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     context = rclpy.Context()
-    rclpy.init(context=context, domain_id=101)
+    rclpy.init(context=context, domain_id=domain)
     nodes = []
 
     def publisher(**policies):

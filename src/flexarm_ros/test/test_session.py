@@ -14,8 +14,6 @@ from flexarm_dynamics.errors import FlexarmError
 from flexarm_ros import session as session_of
 from flexarm_ros.session import Latest, Session, WaitError, parameter_messages, plain
 
-DOMAIN = 101
-
 
 class Processes:
     """Processes that are alive, or dead with these last words."""
@@ -31,9 +29,9 @@ class Processes:
 
 
 @pytest.fixture
-def session():
+def session(domain):
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    with Session("test", domain=DOMAIN, processes=Processes(), patience=20.0) as session:
+    with Session("test", domain=domain, processes=Processes(), patience=20.0) as session:
         yield session
 
 

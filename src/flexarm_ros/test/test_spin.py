@@ -14,14 +14,12 @@ from std_srvs.srv import Trigger
 
 from flexarm_ros import qos, session, spin
 
-DOMAIN = 102
-
 
 @pytest.fixture
-def context():
+def context(domain):
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     made = rclpy.Context()
-    rclpy.init(context=made, domain_id=DOMAIN)
+    rclpy.init(context=made, domain_id=domain)
     yield made
     rclpy.try_shutdown(context=made)
     made.destroy()
