@@ -42,8 +42,26 @@ ERRORS = [
         (
             "design",
             "low passes that end the reach: taken however much motions leave behind",
-            "compared and leaves(short, other) > leaves(task, found)",
-            "False",
+            "more = leaves(short, other) > leaves(task, found)",
+            "more = False",
+        ),
+        (
+            "design",
+            "low passes that end the reach: taken however long modes ring",
+            "return more or rings_longer(task, found, short, other)",
+            "return more",
+        ),
+        (
+            "loop",
+            "joints that stick each by itself: they stick alike",
+            "return A + B @ (sticking[:, None] * rows), B",
+            "return A + B @ (sticking.mean() * rows), B",
+        ),
+        (
+            "uncertain",
+            "joints that stick each by itself: always with the delay",
+            "out += _apart(nominal, stated, at, samples, first, words)",
+            "out += _apart(nominal, stated, at, sampling, first, words)",
         ),
         (
             "uncertain",
@@ -128,8 +146,32 @@ ERRORS = [
         (
             "design",
             "joints that hunt without delay: never",
-            "return min(search.decays(search.slowest.scaled(found.K))) <= 0.0",
+            "return self.at_once()._least(found, STICKS) <= 0.0",
             "return False",
+        ),
+        (
+            "design",
+            "joints that stick each by itself: any growth counts",
+            "_least(found, APART) < -GROWS_FAST",
+            "_least(found, APART) < 0.0",
+        ),
+        (
+            "design",
+            "joints that stick each by itself: not without the delay",
+            "edges=True, at_once=True, apart=True)",
+            "edges=True, apart=True)",
+        ),
+        (
+            "design",
+            "joints that stick each by itself: gains are taken with which the arm does not come back",
+            "return steady if steady.comes_back or not made.comes_back else made",
+            "return steady",
+        ),
+        (
+            "further",
+            "gains that ring longer: the other way round",
+            "rings(_residuals(*one), one[1].K) for one in ((other, than), (task, found))",
+            "rings(_residuals(*one), one[1].K) for one in ((task, found), (other, than))",
         ),
         (
             "settling",
@@ -170,8 +212,8 @@ ERRORS = [
         (
             "settling",
             "after a motion: joints that do not rub count as what rings",
-            "for k, one in self._residuals if one.rubs)",
-            "for k, one in self._residuals)",
+            "for k, one in residuals if one.rubs)",
+            "for k, one in residuals)",
         ),
         (
             "further",

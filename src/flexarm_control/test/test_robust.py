@@ -39,11 +39,12 @@ from flexarm_control.robust.design import (
     units,
     what_limits,
 )
-from flexarm_control.robust.loop import ARM, STICKS, Sampling, sampled_loop
+from flexarm_control.robust.loop import APART, ARM, STICKS, Sampling, sampled_loop
 from flexarm_control.robust.nonsmooth import minimise
 from flexarm_control.robust.search import Search, nearby, start
 from flexarm_control.robust.trade import trade
 from flexarm_control.robust.uncertain import (
+    SOME_STICK,
     STICKING,
     Uncertainty,
     configurations,
@@ -170,6 +171,53 @@ def test_friction_that_is_cancelled_damps_no_loop_that_sticks(two_link):
     assert np.abs(poles(0.0, 1.0)[:2] - poles(0.0, 0.0)[:2]).max() > 0.1
 
 
+def test_a_joint_that_sticks_alone_is_damped_alone(two_link):
+    q, n = np.array([0.3, 0.8]), 2
+    sampling = Sampling(2e-3, 3e-3, 300.0, 200.0, friction=(0.8, 0.8), return_rate=0.5)
+    friction = replace(two_link.arm.joints[0].friction, coulomb=0.02, smoothing=0.01)
+    joints = tuple(replace(j, friction=friction) for j in two_link.arm.joints)
+    rough = build(replace(two_link.arm, joints=joints))
+    alike, each = (
+        sampled_loop(rough, rough, q, sampling, sticking=part) for part in (0.3, [0.3] * n)
+    )
+    assert (alike.kind, each.kind) == (STICKS, APART)
+    assert_allclose(each.F, alike.F, atol=1e-9 * np.abs(alike.F).max())
+    # Nothing cancelled: the same arm with a viscous damper of that size in one joint.
+    damper = replace(joints[1].friction, viscous=joints[1].friction.viscous + 2.0)
+    damped = build(replace(rough.arm, joints=(joints[0], replace(joints[1], friction=damper))))
+    sampling = replace(sampling, friction=(0.0, 0.0))
+    alone = sampled_loop(rough, rough, q, sampling, sticking=[0.0, 1.0])
+    wanted = sampled_loop(damped, damped, q, sampling)
+    assert_allclose(alone.F, wanted.F, atol=1e-7 * np.abs(wanted.F).max())
+    assert sampled_loop(rough, rough, q, sampling, sticking=[0.0, 0.0]).kind == ARM
+
+
+@pytest.mark.parametrize(
+    ("coulomb", "stuck"),
+    [((0.0, 0.0), ()), ((0.0, 0.02), ()), ((0.02, 0.02), ("joint2", "joint1"))],
+)
+def test_each_set_of_joints_that_can_stick_while_others_slide_has_its_loops(
+    two_link, coulomb, stuck
+):
+    joints = tuple(
+        replace(j, friction=replace(j.friction, coulomb=c))
+        for j, c in zip(two_link.arm.joints, coulomb, strict=True)
+    )
+    rough, at = build(replace(two_link.arm, joints=joints)), np.zeros((1, 2))
+    sampling = Sampling(2e-3, 3e-3, 300.0, 200.0, friction=(0.8, 0.8))
+    plain = uncertain_loops(rough, at, sampling, Uncertainty())
+    loops = uncertain_loops(rough, at, sampling, Uncertainty(apart=True))
+    more = loops[len(plain) :]
+    assert [loop.name for loop in loops[: len(plain)]] == [loop.name for loop in plain]
+    assert [loop.name for loop in more] == [
+        f"only {name} sticking{words}, at configuration 1"
+        for words in ("", ", no delay")
+        for name in stuck
+    ]
+    assert all((loop.kind, loop.fraction) == (APART, SOME_STICK) for loop in more)
+    assert all("no delay" in loop.name or len(loop.F) > len(more[-1].F) for loop in more)
+
+
 def test_a_joint_that_sticks_is_as_stiff_as_its_return_makes_it(two_link):
     friction = replace(two_link.arm.joints[0].friction, coulomb=0.02, smoothing=0.01)
     joints = tuple(replace(j, friction=friction) for j in two_link.arm.joints)
@@ -241,7 +289,11 @@ def test_low_passes_that_end_the_reach_are_tried_where_the_decay_is_poor(designe
     found = design(designed.arm, QUICK)
     corner = found.sampling.torque_corner
     assert found.omega_c == corner < designed.omega_c
-    # Gains with which motions leave more behind are not taken, whatever their decay.
+    # Gains with which a mode rings longer where joints rub are not taken, whatever their decay.
+    monkeypatch.setattr(design_module, "rings_longer", lambda task, found, short, other: True)
+    assert design(designed.arm, QUICK).omega_c == designed.omega_c
+    monkeypatch.setattr(design_module, "rings_longer", lambda task, found, short, other: False)
+    # Nor are gains with which motions leave more behind.
     monkeypatch.setattr(design_module, "leaves", lambda task, found: 1.0 + task.short)
     assert design(designed.arm, QUICK).omega_c == designed.omega_c
 

@@ -14,7 +14,7 @@ from flexarm_control.robust import further
 from flexarm_control.robust import search as search_module
 from flexarm_control.robust.design import Settings, design, sampling_for
 from flexarm_control.robust.further import FURTHER, Further, leaves, leaving_less
-from flexarm_control.robust.loop import ARM, MARGIN, STICKS, sampled_loop
+from flexarm_control.robust.loop import APART, ARM, MARGIN, STICKS, sampled_loop
 from flexarm_control.robust.recovery import Recovery
 from flexarm_control.robust.settling import (
     ANGLE,
@@ -26,6 +26,7 @@ from flexarm_control.robust.settling import (
     AfterMotion,
     Residual,
     residuals,
+    rings,
     together,
 )
 from flexarm_control.robust.uncertain import Uncertainty, richer
@@ -270,6 +271,82 @@ def test_gains_with_which_joints_hunt_are_searched_for_again(rough, monkeypatch)
     made = design(rough.task.arm, replace(rough.task.settings, effort=0.1))
     assert made.uncertainty.at_once and asked[0] is False
     assert any("sticking" in row.name and "no delay" in row.name for row in made.slowest)
+
+
+@pytest.fixture(scope="module")
+def rough_pair():
+    """A task for two links whose joints rub, and soft gains of the joints alone."""
+    arm = arm_file.load("two_link")
+    joints = tuple(replace(j, friction=replace(j.friction, coulomb=0.02)) for j in arm.joints)
+    settings = Settings(500.0, 0.002, effort=0.05, configurations=((0.0, 0.7),))
+    task = design_module.Task(replace(arm, joints=joints), settings, UNCERTAIN)
+    loops, weights = task.held(task.sampling, 1)
+    search = task.search_of(loops, weights, task.sampling)
+    found = task.alone(None, None)
+    return SimpleNamespace(task=task, search=search, found=found)
+
+
+def test_a_vibration_that_grows_fast_while_some_joints_stick_is_found(rough_pair, monkeypatch):
+    task = rough_pair.task
+    more = task.apart()
+    loops, _ = more.held(rough_pair.found.sampling, 1)
+    apart = [loop for loop in loops if loop.kind == APART]
+    assert len(apart) == 4  # each joint, with the delay and without
+
+    def growth(K):
+        """Of the fastest of all loops in which some joints stick, over omega_1."""
+        closed = [loop.F - loop.G @ (K @ loop.N) for loop in apart]
+        most = max(np.abs(np.linalg.eigvals(one)).max() for one in closed)
+        return np.log(most) / apart[0].period / task.omega_1
+
+    wild = rough_pair.found._replace(K=5.0 * rough_pair.found.K)
+    fast = growth(wild.K[0])
+    assert fast > 0.0
+    monkeypatch.setattr(design_module, "GROWS_FAST", 0.99 * fast)
+    assert task.hunts_apart(wild) and not more.hunts_apart(wild)  # those loops are held already
+    monkeypatch.setattr(design_module, "GROWS_FAST", 1.01 * fast)
+    assert not task.hunts_apart(wild)
+
+
+def test_such_gains_are_searched_for_again_with_these_loops(rough_pair, monkeypatch):
+    asked, task = [], rough_pair.task
+
+    def hunts_apart(task, found):
+        asked.append(task.uncertainty.apart)
+        return True
+
+    monkeypatch.setattr(design_module.Task, "hunts_apart", hunts_apart)
+    monkeypatch.setattr(further, "FURTHER", ())
+    made = design(task.arm, task.settings)
+    assert asked == [False]
+    assert made.uncertainty.apart and made.uncertainty.at_once and made.uncertainty.edges
+    assert made.decay > 0.0 and any(row.kind == APART for row in made.slowest)
+    # If the arm does not come back from its torque limits with the new gains, the old ones stay.
+    old = design_module.recovery
+
+    def lost(model, at, sampling, uncertainty, K):
+        found = old(model, at, sampling, uncertainty, K)
+        return replace(found, later=np.inf) if uncertainty.apart else found
+
+    monkeypatch.setattr(design_module, "recovery", lost)
+    assert not design(task.arm, task.settings).uncertainty.apart
+
+
+def test_gains_ring_longer_if_the_slowest_mode_that_rings_loses_a_tenth_of_its_decay(
+    rough, monkeypatch
+):
+    task, found = rough.task, rough.found
+    each = residuals(task.nominal, task.at[0], found.sampling, UNCERTAIN)
+    numbered = [(0, one) for one in each]
+    slowest = rings(numbered, found.K)
+    assert slowest == min(one.ringing(found.K[0]) for one in each if one.rubs)
+    weak = found._replace(K=0.5 * found.K)
+    assert rings(numbered, weak.K) < 0.9 * slowest
+    monkeypatch.setattr(further, "RINGS", 2.0 * slowest / task.speed)
+    assert further.rings_longer(task, found, task, weak)
+    assert not further.rings_longer(task, found, task, found)
+    monkeypatch.setattr(further, "RINGS", 0.0)
+    assert not further.rings_longer(task, found, task, weak)
 
 
 def test_loops_are_there_for_an_arm_for_a_margin_or_stick(rough):

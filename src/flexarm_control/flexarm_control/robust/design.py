@@ -27,9 +27,9 @@ from ..feedforward.model import METHOD
 from ..low_pass import POLES
 from ..schedule import matters
 from .decay import Slowest, SlowestScheduled, Wanted
-from .further import LEAST, later, leaves, leaving_less
+from .further import LEAST, later, leaves, leaving_less, rings_longer
 from .held import held_loops
-from .loop import ARM, STICKS, Sampling
+from .loop import APART, ARM, STICKS, Sampling
 from .noise import Noise
 from .recovery import Recovery, recovery
 from .search import ROUNDS, STARTS, TOGETHER, Search, follow, nearby, race, start
@@ -88,6 +88,9 @@ FIRST, USUAL, OTHERWISE, NEARBY = 0.7, 0.6, 0.8, 0.9
 #: smaller if friction would move a joint farther than this angle [rad] before the torque can answer. With full
 #: cancellation such a joint would hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
+#: If a vibration grows faster than this while some joints stick and others slide, over omega_1, the arm is likely to
+#: hunt. Then the search goes on with such loops [-].
+GROWS_FAST = 0.9
 #: Decay over omega_1, and noise over the torque limit, at which the fastest design aims.
 FASTEST, NOISIEST = 0.6, 0.03
 #: `slow.return_rate` over omega_1. With the fraction gamma of its friction cancelled, a joint that sticks goes back at
@@ -504,11 +507,8 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
         reached = other.decay if other is not None else -np.inf
         if max(found.decay, reached) < (LEAST if short.low_passes else LITTLE):
             found = task.found_alone(say.part(USUAL, OTHERWISE), gains, found)
-        # Modes beyond the corner may ring long after a motion, although the decay that is asked of others is larger.
-        compared = found.decay > 0.0 and task.nominal.n_modes
-        if reached > max(WORTH * found.decay, 0.0) and not (
-            compared and leaves(short, other) > leaves(task, found)
-        ):
+        better = reached > max(WORTH * found.decay, 0.0)
+        if better and not _rings(task, found, short, other):
             task, found = short, other
     if found.decay < SLOW * task.speed:
         task = Task(arm, settings, replace(uncertainty, edges=True), task.short)
@@ -518,7 +518,7 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
         other = more.from_nearby(say.part(OTHERWISE, NEARBY), found)
         if other.decay > 0.0:
             task, found = more, other
-    made = task.design(found)
+    kept, made = found, task.design(found)
     if found.decay > 0.0 and task.nominal.n_modes:
         edged = Task(arm, settings, replace(task.uncertainty, edges=True), task.short)
         other = leaving_less(edged, found, say.part(NEARBY, 1.0), asked)
@@ -528,9 +528,38 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
         if other is not None:
             sooner = edged.design(other)
             if not later(sooner.recovery, made.recovery):
-                made = sooner
+                kept, made = other, sooner
+    if task.hunts_apart(kept):
+        made = _steadied(task, kept, made, asked, say.part(NEARBY, 1.0))
     say.part(0.0, 1.0)(1.0, made.decay)
     return made
+
+
+def _rings(task, found, short, other):
+    """Whether the gains `other` of the task `short` leave more behind than the `found` ones of `task`, or ring longer.
+
+    Modes beyond the corner of a low pass may ring long after a motion, although the decay that is asked of the others
+    is larger. Nothing is compared with unstable gains.
+    """
+    if found.decay <= 0.0 or not task.nominal.n_modes:
+        return False
+    more = leaves(short, other) > leaves(task, found)
+    return more or rings_longer(task, found, short, other)
+
+
+def _steadied(task, found, made, asked, progress):
+    """The design that goes on from the `found` gains until no vibration grows while some joints stick.
+
+    It is `made`, the design with the `found` gains, if there are no such gains, or if with them the arm no longer comes
+    back from its torque limits. The requested speed is `asked`, as in `design_at`.
+    """
+    loops = replace(task.uncertainty, edges=True, at_once=True, apart=True)
+    apart = Task(task.arm, task.settings, loops, task.short)
+    other = apart.from_nearby(progress, found)
+    if other.decay <= 0.0:
+        return made
+    steady = apart.design(leaving_less(apart, other, progress, asked) or other)
+    return steady if steady.comes_back or not made.comes_back else made
 
 
 class _Progress:
@@ -695,17 +724,38 @@ class Task:
         rubs = any(joint.friction.coulomb for joint in self.arm.joints)
         if not rubs or self.uncertainty.at_once or found.decay <= 0.0:
             return False
-        loops, weights = self.at_once().held(found.sampling, len(found.K))
-        stuck = [k for k, loop in enumerate(loops) if loop.kind == STICKS]
-        search = self.search_of(
-            [loops[k] for k in stuck], [weights[k] for k in stuck], found.sampling
-        )
-        return min(search.decays(search.slowest.scaled(found.K))) <= 0.0
+        return self.at_once()._least(found, STICKS) <= 0.0
 
     def at_once(self):
         """The same task; the loops of joints that stick are there without the delay as well."""
         more = replace(self.uncertainty, at_once=True)
         return Task(self.arm, self.settings, more, self.short)
+
+    def hunts_apart(self, found):
+        """Whether a vibration grows fast if some joints stick and others slide (`GROWS_FAST`).
+
+        False if the task has such loops, or if the `found` gains are unstable.
+        """
+        rubs = any(joint.friction.coulomb for joint in self.arm.joints)
+        if not rubs or self.uncertainty.apart or found.decay <= 0.0:
+            return False
+        return self.apart()._least(found, APART) < -GROWS_FAST
+
+    def apart(self):
+        """The same task, with loops in which some joints stick and others slide."""
+        more = replace(self.uncertainty, apart=True)
+        return Task(self.arm, self.settings, more, self.short)
+
+    def _least(self, found, kind):
+        """The least decay of the loops of one kind, over what is asked of them; infinite: there are none [-]."""
+        loops, weights = self.held(found.sampling, len(found.K))
+        those = [k for k, loop in enumerate(loops) if loop.kind == kind]
+        if not those:
+            return np.inf
+        search = self.search_of(
+            [loops[k] for k in those], [weights[k] for k in those], found.sampling
+        )
+        return min(search.decays(search.slowest.scaled(found.K)))
 
     def held(self, sampling, count):
         """Loops in and between the configurations, and the weights of `count` sets of gains in each loop."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from .loop import ARM, MARGIN
-from .settling import AfterMotion, residuals, together
+from .settling import AfterMotion, residuals, rings, together
 
 #: The slowest pole of all loops keeps the fraction `KEEP` of the decay that was reached, and at least `LEAST`. If its
 #: decay was less than `LEAST`, it keeps all of it [-].
@@ -102,6 +102,15 @@ def _residuals(task, found):
         for k, q in enumerate(task.at)
         for one in residuals(task.nominal, q, found.sampling, task.uncertainty)
     ]
+
+
+def rings_longer(task, found, other, than):
+    """Whether the gains `than`, found in the task `other`, ring longer than the `found` ones of `task`.
+
+    This is the test by which new gains of `leaving_less` are refused.
+    """
+    now, before = (rings(_residuals(*one), one[1].K) for one in ((other, than), (task, found)))
+    return _rings_longer(now, before, task.speed)
 
 
 def later(now, before):

@@ -34,8 +34,9 @@ from flexarm_dynamics.linear import linear_plant, sampled
 
 from ..low_pass import POLES, LowPass
 
-#: Kind of a `Loop`: an arm within the uncertainty; a margin of gain, delay or modes; an arm whose joints stick.
-ARM, MARGIN, STICKS = "arm", "margin", "sticks"
+#: Kind of a `Loop`: an arm within the uncertainty; a margin of gain, delay or modes; an arm whose joints stick; an arm
+#: of which some joints stick while the others slide.
+ARM, MARGIN, STICKS, APART = "arm", "margin", "sticks", "apart"
 
 
 @dataclass(frozen=True)
@@ -94,13 +95,15 @@ def sampled_loop(
         Of the loop.
     fraction : float
         Fraction of the decay that is asked of the loop [-].
-    sticking : float
+    sticking : float or sequence of float
         Coulomb friction as a damper, over the damper that it is at rest: 1.0 at rest, less for larger movements, 0.0
-        without friction [-].
+        without friction; for all joints, or for each, (n,) [-].
     kind : str
-        Kind of the loop: `ARM` or `MARGIN`; with `sticking` it is `STICKS`.
+        Kind of the loop: `ARM` or `MARGIN`; with `sticking` it is `STICKS`, or `APART` if each joint has its own.
     """
     n, m, mp = nominal.n_joints, nominal.n_modes, plant.n_modes
+    each = np.ndim(sticking) > 0
+    sticking = np.array(sticking, float) if each else sticking
     A, B = _plant(plant, np.asarray(q, float), sticking)
     B = gain * B
     h, size, p = sampling.period, A.shape[0], n + m
@@ -141,7 +144,7 @@ def sampled_loop(
         low_pass = LowPass(n, sampling.torque_corner).state_space(h)
         F[passed, passed], G[passed], out[:, passed], through = low_pass
 
-    if sticking:
+    if np.any(sticking):
         _, coulomb, smoothing = nominal.friction_table().T
         damper = sticking * coulomb / smoothing
         cancelled = np.array(sampling.friction) * damper
@@ -174,13 +177,19 @@ def sampled_loop(
     N[2 * n : 3 * n, at_w:at_v] = np.eye(n)
     N[3 * n : 3 * n + m, :size] = C[n:]
     N[3 * n + m :] = rate[n:]
-    kind = STICKS if sticking else kind
+    if np.any(sticking):
+        kind = APART if each else STICKS
     return Loop(name, F, G, N, h, fraction, kind, out, through, effect)
 
 
 def _plant(plant, q, sticking):
     """A and B of the `plant` at rest, with the fraction `sticking` of the damper of Coulomb friction at rest."""
     A, B = linear_plant(plant, q, coulomb=False)
-    if not sticking:
+    if not np.any(sticking):
         return A, B
+    if np.ndim(
+        sticking
+    ):  # friction acts where the torques do: each joint's part is a column of B times a row
+        rows = np.linalg.lstsq(B, linear_plant(plant, q, coulomb=True)[0] - A)[0]
+        return A + B @ (sticking[:, None] * rows), B
     return (1.0 - sticking) * A + sticking * linear_plant(plant, q, coulomb=True)[0], B

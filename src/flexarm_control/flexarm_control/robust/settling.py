@@ -175,6 +175,18 @@ def together(values):
     return float(most * ((np.array(values) / most) ** POWER).sum() ** (1.0 / POWER))
 
 
+def rings(residuals, K):
+    """Least `Residual.ringing` of the arms whose joints friction damps; infinite: there are none [-].
+
+    Parameters
+    ----------
+    residuals : sequence of (int, Residual)
+        Each after the number of its set of gains.
+    K : ndarray, shape (k, n, 3n + 2m)
+    """
+    return min((one.ringing(K[k]) for k, one in residuals if one.rubs), default=np.inf)
+
+
 class AfterMotion:
     r"""J of all arms and configurations of a design, :math:`(\sum_i J_i^8)^{1/8}`, as a function of scaled gains.
 
@@ -204,9 +216,8 @@ class AfterMotion:
         return float(value), np.concatenate([(one * scale)[free] for one in slope])
 
     def ringing(self, x):
-        """Least `Residual.ringing` of the arms whose joints friction damps; infinite: there are none [-]."""
-        K = self._slowest.gains(x)
-        return min((one.ringing(K[k]) for k, one in self._residuals if one.rubs), default=np.inf)
+        """`rings` of all arms with scaled gains x [-]."""
+        return rings(self._residuals, self._slowest.gains(x))
 
     def settling(self, x):
         """Longest settling time of all, in locked periods."""

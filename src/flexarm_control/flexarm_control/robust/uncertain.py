@@ -2,6 +2,7 @@
 """The set of loops for a design: what may differ from the arm file, and in which configurations the arm is."""
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -20,6 +21,8 @@ UNLIKELY = 0.5
 #: rest, and the fraction of the decay that is asked in each case. At rest the arm creeps, with the time constant
 #: friction over stiffness.
 STICKING = {1.0: 0.1, 0.1: 0.3}
+#: Fraction of the decay that is asked of an arm of which some joints stick and others slide.
+SOME_STICK = 0.1
 #: Every mode is assumed to have at least this damping ratio [-].
 MIN_DAMPING = 1e-4
 
@@ -45,6 +48,8 @@ class Uncertainty:
         Whether the loops include arms of which only payload or only stiffness differs.
     at_once : bool
         Whether the loops of joints that stick are also there without the delay.
+    apart : bool
+        Whether there are loops in which some joints stick while the others slide.
     """
 
     payload: tuple = (0.7, 1.3)
@@ -54,6 +59,7 @@ class Uncertainty:
     delay: float = 1.0
     edges: bool = False
     at_once: bool = False
+    apart: bool = False
 
     @property
     def torque_share(self):
@@ -145,6 +151,8 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
       with every fraction of this damper does not hunt.
     - With ``uncertainty.edges``: arms of which only payload or only stiffness differs, with the delay.
     - With ``uncertainty.at_once``: the loops of the arms that stick, also without the delay.
+    - With ``uncertainty.apart``: in each configuration the stated arm, with each set of joints that can stick while the
+      others slide, with the delay and without.
 
     In all loops joint speeds are filtered derivatives, like the observer's (`observer.measured_velocity`). A loop with
     measured speeds differs from these.
@@ -209,6 +217,9 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
         out += _sticking(nominal, plants, at, sampling, first)
         if uncertainty.at_once:
             out += _sticking(nominal, plants, at, at_once, first, ", no delay", UNLIKELY)
+        if uncertainty.apart:
+            for words, (samples, *_) in timings.items():
+                out += _apart(nominal, stated, at, samples, first, words)
     return out
 
 
@@ -225,6 +236,19 @@ def _sticking(nominal, plants, at, sampling, first, more="", likely=1.0):
                 if rests(plant, q):
                     asked = likely * fraction
                     out.append(sampled_loop(nominal, plant, q, sampling, 1.0, words, asked, part))
+    return out
+
+
+def _apart(nominal, plant, at, sampling, first, more):
+    """Loops of a `plant` of which some joints stick and the others slide; `more` is added to their names."""
+    joints, out = plant.arm.joints, []
+    choices = product(*([0.0, 1.0] if joint.friction.coulomb else [0.0] for joint in joints))
+    some = list(choices)[1:-1]  # neither none nor all
+    for i, q in enumerate(at, first):
+        for which in some if rests(plant, q) else ():
+            stuck = " and ".join(j.name for j, part in zip(joints, which, strict=True) if part)
+            words = f"only {stuck} sticking{more}, at configuration {i}"
+            out.append(sampled_loop(nominal, plant, q, sampling, 1.0, words, SOME_STICK, which))
     return out
 
 
