@@ -48,7 +48,7 @@ ERRORS = [
         (
             "design",
             "low passes that end the reach: taken however long modes ring",
-            "return more or rings_longer(task, found, short, other)",
+            "return more or (found.decay >= LEAST and rings_longer(task, found, short, other))",
             "return more",
         ),
         (
@@ -166,6 +166,18 @@ ERRORS = [
             "joints that stick each by itself: gains are taken with which the arm does not come back",
             "return steady if steady.comes_back or not made.comes_back else made",
             "return steady",
+        ),
+        (
+            "design",
+            "joints that stick each by itself: gains that leave less are taken however late the arm then is",
+            "if not later(sooner.recovery, steady.recovery):",
+            "if True:",
+        ),
+        (
+            "design",
+            "joints that stick each by itself: gains are taken however slow the loops are",
+            "if other.decay < min(found.decay, LEAST):",
+            "if other.decay < 0.0:",
         ),
         (
             "further",

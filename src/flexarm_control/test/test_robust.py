@@ -16,6 +16,7 @@ from flexarm_control.low_pass import LowPass
 from flexarm_control.robust import card as card_module
 from flexarm_control.robust import design as design_module
 from flexarm_control.robust import trade as trade_module
+from flexarm_control.robust import uncertain as uncertain_module
 from flexarm_control.robust.card import card, poles, torque_used
 from flexarm_control.robust.decay import (
     Slowest,
@@ -218,6 +219,23 @@ def test_each_set_of_joints_that_can_stick_while_others_slide_has_its_loops(
     assert all("no delay" in loop.name or len(loop.F) > len(more[-1].F) for loop in more)
 
 
+def test_of_many_joints_only_one_sticks_alone_or_slides_alone(two_link, monkeypatch):
+    chosen = []
+    monkeypatch.setattr(uncertain_module, "rests", lambda plant, q: True)
+    monkeypatch.setattr(uncertain_module, "sampled_loop", lambda *all_: chosen.append(all_[-1]))
+    for n, count in ((4, 14), (5, 10), (6, 12)):
+        joint = replace(
+            two_link.arm.joints[0],
+            friction=replace(two_link.arm.joints[0].friction, coulomb=0.02),
+        )
+        plant = SimpleNamespace(arm=SimpleNamespace(joints=(joint,) * n))
+        chosen.clear()
+        uncertain_module._apart(None, plant, np.zeros((1, n)), None, 1, "")
+        assert len(chosen) == len(set(chosen)) == count
+        assert all(0 < sum(which) < n for which in chosen)
+        assert n == 4 or all(sum(which) in (1, n - 1) for which in chosen)
+
+
 def test_a_joint_that_sticks_is_as_stiff_as_its_return_makes_it(two_link):
     friction = replace(two_link.arm.joints[0].friction, coulomb=0.02, smoothing=0.01)
     joints = tuple(replace(j, friction=friction) for j in two_link.arm.joints)
@@ -292,6 +310,9 @@ def test_low_passes_that_end_the_reach_are_tried_where_the_decay_is_poor(designe
     # Gains with which a mode rings longer where joints rub are not taken, whatever their decay.
     monkeypatch.setattr(design_module, "rings_longer", lambda task, found, short, other: True)
     assert design(designed.arm, QUICK).omega_c == designed.omega_c
+    # They are, if the decay of the usual gains is too small.
+    monkeypatch.setattr(design_module, "LEAST", np.inf)
+    assert design(designed.arm, QUICK).omega_c == corner
     monkeypatch.setattr(design_module, "rings_longer", lambda task, found, short, other: False)
     # Nor are gains with which motions leave more behind.
     monkeypatch.setattr(design_module, "leaves", lambda task, found: 1.0 + task.short)
@@ -485,6 +506,7 @@ def test_an_arm_that_friction_lets_creep_swings_no_longer_than_one_without(desig
     ("name", "pole", "change", "words"),
     [
         ("a joint", -0.1 + 0.1j, {"kind": STICKS}, "friction: a joint that sticks creeps"),
+        ("a joint", -0.1 + 0.1j, {"kind": APART}, "friction: a joint that sticks creeps"),
         ("stated", -1.0 + 300.0j, {}, "delay: the torque for this mode of 47.7 Hz is"),
         ("stated", -1.0 + 60.0j, {"slope": 0.1}, "reach: torque hardly moves this mode of 9.55 Hz"),
         ("stated", -1.0 + 60.0j, {"noise": (0.5, 0.99)}, "noise: "),

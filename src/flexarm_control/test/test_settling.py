@@ -329,7 +329,45 @@ def test_such_gains_are_searched_for_again_with_these_loops(rough_pair, monkeypa
         return replace(found, later=np.inf) if uncertainty.apart else found
 
     monkeypatch.setattr(design_module, "recovery", lost)
-    assert not design(task.arm, task.settings).uncertainty.apart
+    kept = design(task.arm, task.settings)
+    assert kept.hunts and not kept.uncertainty.apart
+
+
+def test_what_such_a_search_finds_is_taken_if_no_loop_gets_too_slow_and_the_arm_is_not_later(
+    rough_pair, monkeypatch
+):
+    task, found = rough_pair.task, rough_pair.found
+    made, less = task.design(found), found._replace(K=1.01 * found.K)
+    monkeypatch.setattr(design_module.Task, "from_nearby", lambda self, say, found: found)
+    monkeypatch.setattr(design_module, "leaving_less", lambda *_: less)
+
+    def steadied():
+        return design_module._steadied(task, found, made, 1.0, lambda fraction, decay: None)
+
+    monkeypatch.setattr(design_module, "later", lambda now, before: False)
+    assert_allclose(steadied().K, less.K[0])
+    assert not steadied().hunts
+    monkeypatch.setattr(design_module, "later", lambda now, before: True)
+    assert steadied().uncertainty.apart
+    assert_allclose(steadied().K, made.K)
+    (row, *rows) = found.rows
+    slow = found._replace(rows=(row._replace(value=-0.01), *rows))
+    assert 0.0 < slow.decay < min(found.decay, further.LEAST)
+    monkeypatch.setattr(design_module.Task, "from_nearby", lambda self, say, found: slow)
+    kept = steadied()
+    assert kept.hunts and not kept.uncertainty.apart  # it is marked
+    assert_allclose(kept.K, made.K)
+
+
+def test_a_rigid_arm_whose_joints_stick_is_searched_for_too():
+    arm = arm_file.load("rigid")
+    joints = tuple(replace(j, friction=replace(j.friction, coulomb=0.5)) for j in arm.joints)
+    settings = Settings(500.0, 0.002, effort=0.05, configurations=((0.2, 0.4),))
+    task = design_module.Task(replace(arm, joints=joints), settings, UNCERTAIN)
+    found = task.alone(None, None)
+    assert found.decay > 0.0 and not task.nominal.n_modes
+    made = design_module._steadied(task, found, task.design(found), 1.0, lambda *_: None)
+    assert made.uncertainty.apart and made.decay > 0.0
 
 
 def test_gains_ring_longer_if_the_slowest_mode_that_rings_loses_a_tenth_of_its_decay(
@@ -546,3 +584,5 @@ def test_ringing_is_judged_by_the_decay_that_is_lost_and_at_a_lower_speed_less_i
     longer = further._rings_longer
     assert longer(0.02, 0.03, 1.0) and not longer(0.02, 0.03, 0.5)
     assert not longer(-0.01, -0.01, 1.0) and longer(-0.0111, -0.01, 1.0)
+    assert longer(0.02, np.inf, 1.0) and not longer(0.04, np.inf, 1.0)  # no mode rang before
+    assert not longer(np.inf, np.inf, 1.0)

@@ -10,20 +10,22 @@ MAX_LEAVE = 10
 
 
 @contextlib.contextmanager
-def bounded(seconds=MAX_LEAVE):
-    """End this process by SIGALRM if the context takes longer than `seconds` (int).
+def bounded():
+    """End this process by SIGALRM if the context takes longer than `MAX_LEAVE`.
 
     FastDDS 2.14 can wait for ever in ``destroy_node`` if another process of the domain starts or ends just then. It
     waits in C++ with Python's lock held, so no thread and no signal handler of Python can end it: only a signal's
-    default action does. In another thread than the main one this context does nothing.
+    default action does. An alarm that was set before is cancelled. In another thread than the main one this context
+    does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(seconds)
+    signal.alarm(MAX_LEAVE)
     try:
         yield
     finally:
         signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+        if before is not None:  # a handler of Python
+            signal.signal(signal.SIGALRM, before)

@@ -1,25 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
 """A process that cannot leave the graph of nodes is ended, and what leaves in time goes on as before."""
 
+import os
 import signal
 import subprocess
 import sys
 import threading
 
+import pytest
+
 from flexarm_ros import ending
 
 # C code that holds Python's lock and never returns, as FastDDS does.
-STUCK = """
+BEGIN = """
 import ctypes
+from types import SimpleNamespace
 from flexarm_ros import ending
-with ending.bounded(1):
-    ctypes.PyDLL(None).pause()
+from flexarm_ros.node import run
+from flexarm_ros.session import Session
+ending.MAX_LEAVE = 1
+stuck = ctypes.PyDLL(None).pause
 """
+CASES = {
+    "anything": "with ending.bounded():\n    stuck()",
+    "a node's process": """
+node = SimpleNamespace(autostart=lambda: False, active=False, destroy_node=stuck)
+run(lambda: node, [])
+""",
+    "a session": """
+session = Session("stuck")
+session.node.destroy_node = stuck
+session.close()
+""",
+}
 
 
-def test_a_process_that_is_stuck_in_c_is_ended():
-    stuck = subprocess.run([sys.executable, "-c", STUCK], timeout=60, check=False)
-    assert stuck.returncode == -signal.SIGALRM
+@pytest.mark.parametrize("case", CASES)
+def test_a_process_that_is_stuck_in_c_is_ended(case, domain):
+    process = subprocess.run(
+        [sys.executable, "-c", BEGIN + CASES[case]],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        timeout=60,
+        check=False,
+    )
+    assert process.returncode == -signal.SIGALRM
 
 
 def test_what_ends_in_time_leaves_no_alarm_and_the_handler_of_before():

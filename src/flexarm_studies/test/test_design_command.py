@@ -3,6 +3,7 @@
 
 import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
@@ -101,6 +102,17 @@ def test_a_design_that_is_slower_for_its_torque_limits_states_it(tmp_path, capsy
     assert (
         "warning: after a motion that takes much of its torque the arm swings for long" in printed
     )
+
+
+def test_a_design_with_which_an_arm_may_hunt_has_a_warning(capsys, monkeypatch):
+    made = design_module.design_at
+
+    def hunts(*args, **more):
+        return replace(made(*args, **more), hunts=True)
+
+    monkeypatch.setattr(design_module, "design_at", hunts)
+    assert main(["design", "R", *LOOP, "--effort", "0.1"]) == 0
+    assert "warning: a vibration grows fast while some joints stick" in capsys.readouterr().out
 
 
 def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):

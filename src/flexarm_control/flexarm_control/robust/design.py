@@ -61,7 +61,7 @@ HARDLY, FAST = 1.0, 0.5
 FROM_LIMITS = "an arm with faster gains would not come back from them in time"
 #: If the decay of the first search is less than `POOR` times the speed, low passes with a corner below omega_c are
 #: tried. Modes beyond such a corner are only asked to keep their own damping. The result is used if its decay is more
-#: than `WORTH` times larger, and motions leave no more behind than with the first result [-].
+#: than `WORTH` times larger, motions leave no more behind than with the first result, and no mode rings longer [-].
 POOR, WORTH = 0.25, 1.2
 #: If gains scheduled with such low passes reach less decay than this, one set for all configurations is tried as well.
 #: One set without these low passes is tried if the best decay so far is below `further.LEAST`, or, if there are no such
@@ -82,15 +82,16 @@ SLOWER = (0.7, 0.5, 0.35)
 #: Lowest speed; a lower one counts as this.
 SLOWEST = 0.05
 #: Progress at the end of the first design; slower designs may follow. Then, within one design, progress at the end of
-#: the usual search, of the attempts after a poor result, and of the search from nearby gains.
-FIRST, USUAL, OTHERWISE, NEARBY = 0.7, 0.6, 0.8, 0.9
+#: the usual search, of the attempts after a poor result, of the search from nearby gains, and of the search for gains
+#: with which motions leave less.
+FIRST, USUAL, OTHERWISE, NEARBY, LESS = 0.7, 0.6, 0.75, 0.85, 0.93
 #: Fraction of the file's Coulomb friction that is cancelled, since friction may be less by a fifth. The fraction is
 #: smaller if friction would move a joint farther than this angle [rad] before the torque can answer. With full
 #: cancellation such a joint would hunt.
 CANCELLED, KICK = 0.8, np.radians(0.1)
 #: If a vibration grows faster than this while some joints stick and others slide, over omega_1, the arm is likely to
 #: hunt. Then the search goes on with such loops [-].
-GROWS_FAST = 0.9
+GROWS_FAST = 0.8
 #: Decay over omega_1, and noise over the torque limit, at which the fastest design aims.
 FASTEST, NOISIEST = 0.6, 0.03
 #: `slow.return_rate` over omega_1. With the fraction gamma of its friction cancelled, a joint that sticks goes back at
@@ -178,6 +179,9 @@ class Design:
     slowed : bool
         Whether the speed is lower than requested, because the arm would not come back from its torque limits with
         faster gains.
+    hunts : bool
+        Whether a vibration grows fast while some joints stick and others slide (`GROWS_FAST`), and no gains were found
+        with which it does not.
     """
 
     arm: object
@@ -197,6 +201,7 @@ class Design:
     sets: np.ndarray | None = None
     recovery: Recovery | None = None
     slowed: bool = False
+    hunts: bool = False
 
     def __post_init__(self):
         if self.sets is None:
@@ -353,7 +358,7 @@ def what_limits(found):
     """In words, why the slowest pole of a stable design is no faster."""
     pole = found.worst.pole
     hertz, lag = abs(pole) / (2.0 * np.pi), _lag(found, pole)
-    if found.worst.kind == STICKS and abs(pole) < found.omega_1:
+    if found.worst.kind in (STICKS, APART) and abs(pole) < found.omega_1:
         return "friction: a joint that sticks creeps to its place, and only the integral moves it"
     if lag > FAST:
         return (
@@ -521,16 +526,16 @@ def design_at(arm, settings, uncertainty, progress=None, gains=None, asked=None)
     kept, made = found, task.design(found)
     if found.decay > 0.0 and task.nominal.n_modes:
         edged = Task(arm, settings, replace(task.uncertainty, edges=True), task.short)
-        other = leaving_less(edged, found, say.part(NEARBY, 1.0), asked)
+        other = leaving_less(edged, found, say.part(NEARBY, LESS), asked)
         if other is not None and edged.hunts(other):
             edged = edged.at_once()
-            other = leaving_less(edged, found, say.part(NEARBY, 1.0), asked)
+            other = leaving_less(edged, found, say.part(NEARBY, LESS), asked)
         if other is not None:
             sooner = edged.design(other)
             if not later(sooner.recovery, made.recovery):
                 kept, made = other, sooner
     if task.hunts_apart(kept):
-        made = _steadied(task, kept, made, asked, say.part(NEARBY, 1.0))
+        made = _steadied(task, kept, made, asked, say.part(LESS, 1.0))
     say.part(0.0, 1.0)(1.0, made.decay)
     return made
 
@@ -539,26 +544,33 @@ def _rings(task, found, short, other):
     """Whether the gains `other` of the task `short` leave more behind than the `found` ones of `task`, or ring longer.
 
     Modes beyond the corner of a low pass may ring long after a motion, although the decay that is asked of the others
-    is larger. Nothing is compared with unstable gains.
+    is larger. Nothing is compared with unstable gains, and ringing is not compared if the `found` gains have less decay
+    than `further.LEAST`.
     """
     if found.decay <= 0.0 or not task.nominal.n_modes:
         return False
     more = leaves(short, other) > leaves(task, found)
-    return more or rings_longer(task, found, short, other)
+    return more or (found.decay >= LEAST and rings_longer(task, found, short, other))
 
 
 def _steadied(task, found, made, asked, progress):
     """The design that goes on from the `found` gains until no vibration grows while some joints stick.
 
     It is `made`, the design with the `found` gains, if there are no such gains, or if with them the arm no longer comes
-    back from its torque limits. The requested speed is `asked`, as in `design_at`.
+    back from its torque limits; then it is marked: it `hunts`. The requested speed is `asked`, as in `design_at`.
     """
     loops = replace(task.uncertainty, edges=True, at_once=True, apart=True)
     apart = Task(task.arm, task.settings, loops, task.short)
     other = apart.from_nearby(progress, found)
-    if other.decay <= 0.0:
+    made = replace(made, hunts=True)
+    if other.decay < min(found.decay, LEAST):
         return made
-    steady = apart.design(leaving_less(apart, other, progress, asked) or other)
+    steady = apart.design(other)
+    if task.nominal.n_modes:
+        less = leaving_less(apart, other, progress, asked)
+        sooner = steady if less is None else apart.design(less)
+        if not later(sooner.recovery, steady.recovery):
+            steady = sooner
     return steady if steady.comes_back or not made.comes_back else made
 
 

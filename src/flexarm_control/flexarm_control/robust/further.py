@@ -4,6 +4,8 @@
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from .loop import ARM, MARGIN
 from .settling import AfterMotion, residuals, rings, together
 
@@ -131,6 +133,8 @@ def _kept(reached):
 
 def _rings_longer(now, before, speed):
     """Whether gains are refused for ringing; `now` and `before` are decays of `AfterMotion.ringing` [-]."""
+    if np.isinf(before):  # no mode rang
+        return now < RINGS * speed
     return now < min(before - SHORTER * abs(before), RINGS * speed)
 
 

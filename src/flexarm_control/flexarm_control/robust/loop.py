@@ -66,7 +66,7 @@ class Loop:
     N: np.ndarray  # (3n + 2m, N): measurements
     period: float
     fraction: float = 1.0  # fraction of the decay that is asked of it [-]
-    kind: str = ARM  # ARM, MARGIN or STICKS
+    kind: str = ARM  # ARM, MARGIN, STICKS or APART
     sent: np.ndarray | None = None  # V, (n, N): the torque that is sent is V X + D u
     through: np.ndarray | None = None  # D, (n, n)
     effect: np.ndarray | None = None  # E, (N, n): of a change of the sent torque on the next state
@@ -187,9 +187,9 @@ def _plant(plant, q, sticking):
     A, B = linear_plant(plant, q, coulomb=False)
     if not np.any(sticking):
         return A, B
-    if np.ndim(
-        sticking
-    ):  # friction acts where the torques do: each joint's part is a column of B times a row
-        rows = np.linalg.lstsq(B, linear_plant(plant, q, coulomb=True)[0] - A)[0]
+    if np.ndim(sticking):
+        # Friction acts where the torques do, so each joint's part is a column of B times a row.
+        rubs = linear_plant(plant, q, coulomb=True)[0] - A
+        rows = np.linalg.lstsq(B, rubs, rcond=None)[0]
         return A + B @ (sticking[:, None] * rows), B
     return (1.0 - sticking) * A + sticking * linear_plant(plant, q, coulomb=True)[0], B

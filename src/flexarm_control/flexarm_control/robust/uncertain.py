@@ -23,6 +23,8 @@ UNLIKELY = 0.5
 STICKING = {1.0: 0.1, 0.1: 0.3}
 #: Fraction of the decay that is asked of an arm of which some joints stick and others slide.
 SOME_STICK = 0.1
+#: If more joints than this can stick, only one of them sticks alone or slides alone: there would be too many sets.
+ALL_SETS = 4
 #: Every mode is assumed to have at least this damping ratio [-].
 MIN_DAMPING = 1e-4
 
@@ -152,7 +154,8 @@ def uncertain_loops(nominal, at, sampling, uncertainty, first=1, sticking=True):
     - With ``uncertainty.edges``: arms of which only payload or only stiffness differs, with the delay.
     - With ``uncertainty.at_once``: the loops of the arms that stick, also without the delay.
     - With ``uncertainty.apart``: in each configuration the stated arm, with each set of joints that can stick while the
-      others slide, with the delay and without.
+      others slide, with the delay and without. If more than `ALL_SETS` joints can stick: only one sticks, or only one
+      slides.
 
     In all loops joint speeds are filtered derivatives, like the observer's (`observer.measured_velocity`). A loop with
     measured speeds differs from these.
@@ -242,8 +245,11 @@ def _sticking(nominal, plants, at, sampling, first, more="", likely=1.0):
 def _apart(nominal, plant, at, sampling, first, more):
     """Loops of a `plant` of which some joints stick and the others slide; `more` is added to their names."""
     joints, out = plant.arm.joints, []
+    rubs = sum(joint.friction.coulomb > 0.0 for joint in joints)
     choices = product(*([0.0, 1.0] if joint.friction.coulomb else [0.0] for joint in joints))
     some = list(choices)[1:-1]  # neither none nor all
+    if rubs > ALL_SETS:
+        some = [which for which in some if sum(which) in (1.0, rubs - 1.0)]
     for i, q in enumerate(at, first):
         for which in some if rests(plant, q) else ():
             stuck = " and ".join(j.name for j, part in zip(joints, which, strict=True) if part)

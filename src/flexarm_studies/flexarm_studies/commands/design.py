@@ -159,6 +159,11 @@ def design(options):
         lines.append(
             "warning: after a motion that takes much of its torque the arm swings for long; move it more slowly"
         )
+    if found.hunts:
+        lines.append(
+            "warning: a vibration grows fast while some joints stick and others slide; the arm may hunt: choose a lower"
+            " --speed, or a larger --effort"
+        )
     cycles = _limit_cycles(found, arm, settings.delay)
     lines += [f"warning: {cycle.text}" for cycle in cycles]
     lines += ["", f"written to {out}" if out else text]
