@@ -380,10 +380,10 @@ def test_gains_ring_longer_if_the_slowest_mode_that_rings_loses_a_tenth_of_its_d
     assert slowest == min(one.ringing(found.K[0]) for one in each if one.rubs)
     weak = found._replace(K=0.5 * found.K)
     assert rings(numbered, weak.K) < 0.9 * slowest
-    monkeypatch.setattr(further, "RINGS", 2.0 * slowest / task.speed)
+    monkeypatch.setattr(further, "LEAST", 2.0 * slowest / task.speed)
     assert further.rings_longer(task, found, task, weak)
     assert not further.rings_longer(task, found, task, found)
-    monkeypatch.setattr(further, "RINGS", 0.0)
+    monkeypatch.setattr(further, "LEAST", 0.0)
     assert not further.rings_longer(task, found, task, weak)
 
 

@@ -109,10 +109,11 @@ def _residuals(task, found):
 def rings_longer(task, found, other, than):
     """Whether the gains `than`, found in the task `other`, ring longer than the `found` ones of `task`.
 
-    This is the test by which new gains of `leaving_less` are refused.
+    This is the test by which new gains of `leaving_less` are refused, with `LEAST` in place of `RINGS`: another search
+    may end at gains with which a mode rings a little longer or shorter.
     """
     now, before = (rings(_residuals(*one), one[1].K) for one in ((other, than), (task, found)))
-    return _rings_longer(now, before, task.speed)
+    return _rings_longer(now, before, task.speed, LEAST)
 
 
 def later(now, before):
@@ -131,11 +132,14 @@ def _kept(reached):
     return max(KEEP * reached, min(reached, LEAST))
 
 
-def _rings_longer(now, before, speed):
-    """Whether gains are refused for ringing; `now` and `before` are decays of `AfterMotion.ringing` [-]."""
+def _rings_longer(now, before, speed, least=RINGS):
+    """Whether gains are refused for ringing; `now` and `before` are decays of `AfterMotion.ringing` [-].
+
+    At a speed of 1, gains with which `now` is at least `least` are not refused.
+    """
     if np.isinf(before):  # no mode rang
-        return now < RINGS * speed
-    return now < min(before - SHORTER * abs(before), RINGS * speed)
+        return now < least * speed
+    return now < min(before - SHORTER * abs(before), least * speed)
 
 
 def _parts(loops, decays, eased):
