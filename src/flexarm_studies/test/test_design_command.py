@@ -111,8 +111,11 @@ def test_a_design_with_which_an_arm_may_hunt_has_a_warning(capsys, monkeypatch):
         return replace(made(*args, **more), hunts=True)
 
     monkeypatch.setattr(design_module, "design_at", hunts)
-    assert main(["design", "R", *LOOP, "--effort", "0.1"]) == 0
+    words = ["design", "R", *LOOP, "--effort", "0.1"]
+    assert main(words) == 0
     assert "warning: a vibration grows fast while some joints stick" in capsys.readouterr().out
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["hunts"]
 
 
 def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
@@ -124,7 +127,7 @@ def test_the_card_as_a_drawing_and_as_json(tmp_path, capsys, monkeypatch):
     found = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert found["tip_stiffness_N_m"] > found["tip_stiffness_without_integral_N_m"] > 0.0
     assert 0.0 < found["phase_rad"] < 3.2 and found["settling_s"] > 0.0
-    assert found["speed"] == 1.0 and found["recovery"]["comes_back"]
+    assert found["speed"] == 1.0 and found["recovery"]["comes_back"] and not found["hunts"]
     (used,), (heavier,) = found["torque_used"]
     assert 0.9 < used < heavier < 1.0
     assert found["recovery"]["limited"] >= found["recovery"]["unlimited"] > 0.0

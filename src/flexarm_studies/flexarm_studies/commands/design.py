@@ -206,6 +206,7 @@ def _result(found, bears):
         "recovery": None
         if found.recovery is None
         else asdict(found.recovery) | {"comes_back": found.comes_back},
+        "hunts": found.hunts,
         "gain": list(bears.gain),
         "payload": list(bears.payload),
         "stiffness": list(bears.stiffness),
