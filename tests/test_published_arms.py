@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexarm_control.robust.design import Settings, design
+from flexarm_control.robust.design import design
+from flexarm_control.robust.settings import Settings
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.linear import linear_plant, sampled
 from flexarm_dynamics.models.model import build

@@ -144,13 +144,13 @@ ERRORS = [
         "robust",
         TESTS + "test_settling.py",
         (
-            "design",
+            "task",
             "joints that hunt without delay: never",
             "return self.at_once()._least(found, STICKS) <= 0.0",
             "return False",
         ),
         (
-            "design",
+            "task",
             "joints that stick each by itself: any growth counts",
             "_least(found, APART) < -GROWS_FAST",
             "_least(found, APART) < 0.0",

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from flexarm_control.robust import cache, default
-from flexarm_control.robust.design import Settings, design
+from flexarm_control.robust.design import design
+from flexarm_control.robust.settings import Settings
 from flexarm_control.robust.uncertain import Uncertainty
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError, ParameterError

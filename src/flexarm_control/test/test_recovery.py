@@ -13,9 +13,11 @@ from flexarm_control.low_pass import POLES
 from flexarm_control.robust import design as design_module
 from flexarm_control.robust import recovery as recovery_module
 from flexarm_control.robust import settling
-from flexarm_control.robust.design import SLOWER, Settings, design, sampling_for
+from flexarm_control.robust import task as task_module
+from flexarm_control.robust.design import SLOWER, design
 from flexarm_control.robust.loop import sampled_loop
 from flexarm_control.robust.recovery import LATER, Recovery, recovery
+from flexarm_control.robust.settings import Settings, sampling_for
 from flexarm_control.robust.settling import residuals
 from flexarm_control.robust.uncertain import Uncertainty, richer
 from flexarm_dynamics.arm import arm_file
@@ -238,13 +240,13 @@ def by_speed(monkeypatch, found):
     """`recovery` of designs of each speed; the speeds that are asked come into the list."""
     asked = []
 
-    class Task(design_module.Task):
+    class Task(task_module.Task):
         def __init__(self, arm, settings, *rest, **named):
             asked.append(settings.speed)
             super().__init__(arm, settings, *rest, **named)
 
     monkeypatch.setattr(design_module, "Task", Task)
-    monkeypatch.setattr(design_module, "recovery", lambda *_: found(asked[-1]))
+    monkeypatch.setattr(task_module, "recovery", lambda *_: found(asked[-1]))
     return asked
 
 

@@ -12,9 +12,11 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control, flat
 from flexarm_control.composite.full_order import closed_loop
+from flexarm_control.fading import lowest
 from flexarm_control.low_pass import LowPass
 from flexarm_control.robust import card as card_module
 from flexarm_control.robust import design as design_module
+from flexarm_control.robust import task as task_module
 from flexarm_control.robust import trade as trade_module
 from flexarm_control.robust import uncertain as uncertain_module
 from flexarm_control.robust.card import card, poles, torque_used
@@ -26,23 +28,21 @@ from flexarm_control.robust.decay import (
     find_gradients,
     poles_of,
 )
-from flexarm_control.robust.design import (
+from flexarm_control.robust.design import design, design_at
+from flexarm_control.robust.gains import SlowPole, of_feedforward
+from flexarm_control.robust.loop import APART, ARM, STICKS, Sampling, sampled_loop
+from flexarm_control.robust.nonsmooth import minimise
+from flexarm_control.robust.search import Search, nearby, start
+from flexarm_control.robust.settings import (
     CANCELLED,
     FASTEST,
     KICK,
     NOISIEST,
     Settings,
-    SlowPole,
     cancelled,
-    design,
-    design_at,
-    of_feedforward,
-    units,
-    what_limits,
+    sampling_for,
 )
-from flexarm_control.robust.loop import APART, ARM, STICKS, Sampling, sampled_loop
-from flexarm_control.robust.nonsmooth import minimise
-from flexarm_control.robust.search import Search, nearby, start
+from flexarm_control.robust.task import units
 from flexarm_control.robust.trade import trade
 from flexarm_control.robust.uncertain import (
     SOME_STICK,
@@ -54,6 +54,7 @@ from flexarm_control.robust.uncertain import (
     richer,
     uncertain_loops,
 )
+from flexarm_control.robust.words import what_limits
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.errors import DesignError, ModelError
@@ -320,17 +321,17 @@ def test_low_passes_that_end_the_reach_are_tried_where_the_decay_is_poor(designe
 
 
 def test_a_low_pass_beyond_the_torque_s_reach_does_not_end_it(designed, monkeypatch):
-    task = design_module.Task(designed.arm, QUICK, Uncertainty(), short=True)
+    task = task_module.Task(designed.arm, QUICK, Uncertainty(), short=True)
     corners = task.omega_1 * np.array(task.low_passes)
     assert corners.size and (corners < task.omega_c).all()
     monkeypatch.setattr(design_module, "POOR", 10.0)
-    monkeypatch.setattr(design_module, "LOW_PASS", (np.inf,))
+    monkeypatch.setattr(task_module, "LOW_PASS", (np.inf,))
     found = design(designed.arm, QUICK)
     assert found.omega_c == designed.omega_c and np.isinf(found.sampling.torque_corner)
 
 
 def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed, monkeypatch):
-    monkeypatch.setattr(design_module, "SLOW", 10.0)
+    monkeypatch.setattr(task_module, "SLOW", 10.0)
     fractions = []
     found = design(designed.arm, QUICK, progress=lambda fraction, _: fractions.append(fraction))
     assert found.decay > 0.6 * designed.decay  # of more loops, some of which give way to the others
@@ -348,10 +349,10 @@ def test_a_slow_design_goes_on_from_gains_nearby_and_looks_at_more_arms(designed
 def test_sets_of_gains_that_are_slow_go_on_from_gains_nearby_together(two_link, monkeypatch):
     at = ((0.0, 0.4), (0.0, 1.0))
     settings = Settings(rate=500.0, delay=0.002, effort=0.02, configurations=at)
-    task = design_module.Task(two_link.arm, settings, Uncertainty())
+    task = task_module.Task(two_link.arm, settings, Uncertainty())
     found = task.found(None, None, -np.inf)
-    monkeypatch.setattr(design_module, "TRIES", 100)
-    monkeypatch.setattr(design_module, "SLOW", 10.0)
+    monkeypatch.setattr(task_module, "TRIES", 100)
+    monkeypatch.setattr(task_module, "SLOW", 10.0)
     better = task.from_nearby(None, found)
     assert len(better.K) == 2
     assert better.decay > 1.02 * found.decay > 0.0
@@ -828,8 +829,8 @@ def test_torque_reaches_no_mode_that_turns_by_more_than_a_radian_during_the_dela
 def test_filtered_derivatives_of_a_fast_arm_lag_less(two_link, stiffness, corner):
     """A radian per sample is enough for a slow arm; a fast one has 15 omega_1, up to two radians per sample."""
     arm = build(scaled(two_link.arm, stiffness=stiffness))
-    found = design_module.sampling_for(arm, np.zeros((1, 2)), QUICK)[0]
-    wanted = corner or 15.0 * design_module.lowest(arm)
+    found = sampling_for(arm, np.zeros((1, 2)), QUICK)[0]
+    wanted = corner or 15.0 * lowest(arm)
     assert_allclose([found.joint_corner, found.modal_corner], wanted, rtol=1e-9)
     assert corner or 500.0 < wanted < 1000.0
 

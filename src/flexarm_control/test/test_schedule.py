@@ -10,10 +10,12 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control
 from flexarm_control.robust.decay import SlowestScheduled, Wanted, eigenvalues
-from flexarm_control.robust.design import Settings, design, units
+from flexarm_control.robust.design import design
 from flexarm_control.robust.held import held_loops
 from flexarm_control.robust.loop import Sampling
 from flexarm_control.robust.search import RELAXED, Search
+from flexarm_control.robust.settings import Settings
+from flexarm_control.robust.task import units
 from flexarm_control.robust.uncertain import Uncertainty
 from flexarm_control.schedule import Schedule, matters
 from flexarm_dynamics.arm import arm_file

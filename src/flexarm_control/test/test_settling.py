@@ -12,10 +12,12 @@ from scipy.integrate import solve_ivp
 from flexarm_control.robust import design as design_module
 from flexarm_control.robust import further
 from flexarm_control.robust import search as search_module
-from flexarm_control.robust.design import Settings, design, sampling_for
+from flexarm_control.robust import task as task_module
+from flexarm_control.robust.design import design
 from flexarm_control.robust.further import FURTHER, Further, leaves, leaving_less
 from flexarm_control.robust.loop import APART, ARM, MARGIN, STICKS, sampled_loop
 from flexarm_control.robust.recovery import Recovery
+from flexarm_control.robust.settings import Settings, sampling_for
 from flexarm_control.robust.settling import (
     ANGLE,
     MOTION,
@@ -194,7 +196,7 @@ def test_an_arm_that_is_what_its_file_says_leaves_nothing(r):
 
 def lasting(found):
     """J of a design, and its settling time in locked periods."""
-    task = design_module.Task(found.arm, found.settings, found.uncertainty)
+    task = task_module.Task(found.arm, found.settings, found.uncertainty)
     loops, weights = task.held(found.sampling, len(found.sets))
     search = task.search_of(loops, weights, found.sampling)
     rest = [(0, one) for one in residuals(task.nominal, task.at[0], found.sampling, UNCERTAIN)]
@@ -203,7 +205,7 @@ def lasting(found):
 
 
 def test_what_gains_leave_is_known_without_a_search(r):
-    task = design_module.Task(r.model.arm, r.design.settings, UNCERTAIN)
+    task = task_module.Task(r.model.arm, r.design.settings, UNCERTAIN)
     gains = SimpleNamespace(K=r.design.sets, sampling=r.design.sampling)
     assert leaves(task, gains) == pytest.approx(lasting(r.design)[0], rel=1e-12)
     assert together([]) == 0.0 and np.isinf(together([1.0, np.inf]))
@@ -234,7 +236,7 @@ def rough(r):
     joints = tuple(
         replace(j, friction=replace(j.friction, coulomb=0.1)) for j in r.model.arm.joints
     )
-    task = design_module.Task(replace(r.model.arm, joints=joints), r.design.settings, UNCERTAIN)
+    task = task_module.Task(replace(r.model.arm, joints=joints), r.design.settings, UNCERTAIN)
     loops, weights = task.held(r.design.sampling, 1)
     search = task.search_of(loops, weights, r.design.sampling)
     x = search.slowest.scaled(r.design.sets)
@@ -266,7 +268,7 @@ def test_gains_with_which_joints_hunt_are_searched_for_again(rough, monkeypatch)
         asked.append(task.uncertainty.at_once)
         return not task.uncertainty.at_once
 
-    monkeypatch.setattr(design_module.Task, "hunts", hunts)
+    monkeypatch.setattr(task_module.Task, "hunts", hunts)
     monkeypatch.setattr(further, "FURTHER", ())
     made = design(rough.task.arm, replace(rough.task.settings, effort=0.1))
     assert made.uncertainty.at_once and asked[0] is False
@@ -279,7 +281,7 @@ def rough_pair():
     arm = arm_file.load("two_link")
     joints = tuple(replace(j, friction=replace(j.friction, coulomb=0.02)) for j in arm.joints)
     settings = Settings(500.0, 0.002, effort=0.05, configurations=((0.0, 0.7),))
-    task = design_module.Task(replace(arm, joints=joints), settings, UNCERTAIN)
+    task = task_module.Task(replace(arm, joints=joints), settings, UNCERTAIN)
     loops, weights = task.held(task.sampling, 1)
     search = task.search_of(loops, weights, task.sampling)
     found = task.alone(None, None)
@@ -302,9 +304,9 @@ def test_a_vibration_that_grows_fast_while_some_joints_stick_is_found(rough_pair
     wild = rough_pair.found._replace(K=5.0 * rough_pair.found.K)
     fast = growth(wild.K[0])
     assert fast > 0.0
-    monkeypatch.setattr(design_module, "GROWS_FAST", 0.99 * fast)
+    monkeypatch.setattr(task_module, "GROWS_FAST", 0.99 * fast)
     assert task.hunts_apart(wild) and not more.hunts_apart(wild)  # those loops are held already
-    monkeypatch.setattr(design_module, "GROWS_FAST", 1.01 * fast)
+    monkeypatch.setattr(task_module, "GROWS_FAST", 1.01 * fast)
     assert not task.hunts_apart(wild)
 
 
@@ -315,20 +317,20 @@ def test_such_gains_are_searched_for_again_with_these_loops(rough_pair, monkeypa
         asked.append(task.uncertainty.apart)
         return True
 
-    monkeypatch.setattr(design_module.Task, "hunts_apart", hunts_apart)
+    monkeypatch.setattr(task_module.Task, "hunts_apart", hunts_apart)
     monkeypatch.setattr(further, "FURTHER", ())
     made = design(task.arm, task.settings)
     assert asked == [False]
     assert made.uncertainty.apart and made.uncertainty.at_once and made.uncertainty.edges
     assert made.decay > 0.0 and any(row.kind == APART for row in made.slowest)
     # If the arm does not come back from its torque limits with the new gains, the old ones stay.
-    old = design_module.recovery
+    old = task_module.recovery
 
     def lost(model, at, sampling, uncertainty, K):
         found = old(model, at, sampling, uncertainty, K)
         return replace(found, later=np.inf) if uncertainty.apart else found
 
-    monkeypatch.setattr(design_module, "recovery", lost)
+    monkeypatch.setattr(task_module, "recovery", lost)
     kept = design(task.arm, task.settings)
     assert kept.hunts and not kept.uncertainty.apart
 
@@ -338,7 +340,7 @@ def test_what_such_a_search_finds_is_taken_if_no_loop_gets_too_slow_and_the_arm_
 ):
     task, found = rough_pair.task, rough_pair.found
     made, less = task.design(found), found._replace(K=1.01 * found.K)
-    monkeypatch.setattr(design_module.Task, "from_nearby", lambda self, say, found: found)
+    monkeypatch.setattr(task_module.Task, "from_nearby", lambda self, say, found: found)
     monkeypatch.setattr(design_module, "leaving_less", lambda *_: less)
 
     def steadied():
@@ -353,7 +355,7 @@ def test_what_such_a_search_finds_is_taken_if_no_loop_gets_too_slow_and_the_arm_
     (row, *rows) = found.rows
     slow = found._replace(rows=(row._replace(value=-0.01), *rows))
     assert 0.0 < slow.decay < min(found.decay, further.LEAST)
-    monkeypatch.setattr(design_module.Task, "from_nearby", lambda self, say, found: slow)
+    monkeypatch.setattr(task_module.Task, "from_nearby", lambda self, say, found: slow)
     kept = steadied()
     assert kept.hunts and not kept.uncertainty.apart  # it is marked
     assert_allclose(kept.K, made.K)
@@ -363,7 +365,7 @@ def test_a_rigid_arm_whose_joints_stick_is_searched_for_too():
     arm = arm_file.load("rigid")
     joints = tuple(replace(j, friction=replace(j.friction, coulomb=0.5)) for j in arm.joints)
     settings = Settings(500.0, 0.002, effort=0.05, configurations=((0.2, 0.4),))
-    task = design_module.Task(replace(arm, joints=joints), settings, UNCERTAIN)
+    task = task_module.Task(replace(arm, joints=joints), settings, UNCERTAIN)
     found = task.alone(None, None)
     assert found.decay > 0.0 and not task.nominal.n_modes
     made = design_module._steadied(task, found, task.design(found), 1.0, lambda *_: None)
@@ -490,7 +492,7 @@ def test_gains_that_leave_less_are_not_taken_if_torque_limits_make_the_arm_later
         pair = next(times)
         return None if pair is None else Recovery.of([pair])
 
-    monkeypatch.setattr(design_module, "recovery", recovery)
+    monkeypatch.setattr(task_module, "recovery", recovery)
 
     def leaving(task, sets, progress, asked):
         found.append(1.01 * sets.K)
@@ -503,7 +505,7 @@ def test_gains_that_leave_less_are_not_taken_if_torque_limits_make_the_arm_later
 
 
 def test_gains_that_would_be_slower_than_asked_are_not_taken(r, monkeypatch):
-    task = design_module.Task(r.design.arm, r.design.settings, UNCERTAIN)
+    task = task_module.Task(r.design.arm, r.design.settings, UNCERTAIN)
     loops, weights = task.held(r.design.sampling, 1)
     search = task.search_of(loops, weights, r.design.sampling)
     x = search.slowest.scaled(r.design.sets)

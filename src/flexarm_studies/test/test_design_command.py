@@ -13,6 +13,7 @@ import pytest
 from flexarm_bringup import cli
 from flexarm_control.robust import cache, further
 from flexarm_control.robust import design as design_module
+from flexarm_control.robust import task as task_module
 from flexarm_control.robust.recovery import Recovery
 from flexarm_control.robust.uncertain import Uncertainty
 from flexarm_dynamics.arm import arm_file
@@ -92,7 +93,7 @@ def test_an_arm_gets_a_controller_file_that_says_what_it_bears(tmp_path, capsys)
 def test_a_design_that_is_slower_for_its_torque_limits_states_it(tmp_path, capsys, monkeypatch):
     late = iter([np.inf, 6.0, 5.0, 7.0])
     monkeypatch.setattr(further, "FURTHER", ())
-    monkeypatch.setattr(design_module, "recovery", lambda *_: Recovery.of([(next(late), 1.0)]))
+    monkeypatch.setattr(task_module, "recovery", lambda *_: Recovery.of([(next(late), 1.0)]))
     out = tmp_path / "made.yaml"
     assert main(["design", "R", *LOOP, "--effort", "0.1", "--out", str(out)]) == 0
     printed = capsys.readouterr().out

@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose
 
 from flexarm_control.composite.assembly import control
 from flexarm_control.robust.default import Default
-from flexarm_control.robust.design import Settings, design
+from flexarm_control.robust.design import design
+from flexarm_control.robust.settings import Settings
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.errors import DesignError, FlexarmError

@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from flexarm_control.robust.design import Settings, design
+from flexarm_control.robust.design import design
+from flexarm_control.robust.settings import Settings
 from flexarm_control.robust.settling import ANGLE, residuals
 from flexarm_control.robust.uncertain import Uncertainty
 from flexarm_dynamics.models.model import build

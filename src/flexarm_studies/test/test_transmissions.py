@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexarm_control.robust.design import Settings, design
+from flexarm_control.robust.design import design
 from flexarm_control.robust.limit_cycle import describing_function
+from flexarm_control.robust.settings import Settings
 from flexarm_control.robust.uncertain import Uncertainty, uncertain_loops
 from flexarm_dynamics.arm import arm_file
 from flexarm_dynamics.models.model import build

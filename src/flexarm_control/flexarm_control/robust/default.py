@@ -14,7 +14,9 @@ from flexarm_dynamics.parameters import check_all, parameter
 from ..composite.design import PARAMETERS as DESIGN
 from . import cache
 from .card import card
-from .design import Settings, design, observer_parameters, places, sampling_for
+from .design import design
+from .gains import observer_parameters
+from .settings import Settings, places, sampling_for
 from .uncertain import Uncertainty
 
 #: Names of the shipped arms for which the parameters' defaults are made.

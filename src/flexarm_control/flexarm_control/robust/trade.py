@@ -3,7 +3,8 @@
 
 from dataclasses import replace
 
-from .design import Settings, design_at
+from .design import design_at
+from .settings import Settings
 from .uncertain import Uncertainty
 
 

@@ -106,10 +106,11 @@ def add_arguments(parser):
 def design(options):
     """Run ``design``."""
     from flexarm_control.robust.card import card
-    from flexarm_control.robust.design import FROM_LIMITS, Settings
     from flexarm_control.robust.design import design as find
+    from flexarm_control.robust.settings import Settings
     from flexarm_control.robust.trade import trade
     from flexarm_control.robust.uncertain import Uncertainty
+    from flexarm_control.robust.words import FROM_LIMITS
     from flexarm_dynamics.arm import arm_file
 
     arm = arm_file.load(options.arm)
@@ -189,7 +190,7 @@ def _limit_cycles(found, arm, delay):
 
 def _result(found, bears):
     """What is printed as JSON."""
-    from flexarm_control.robust.design import what_limits
+    from flexarm_control.robust.words import what_limits
 
     return {
         "parameters": found.parameters(),
@@ -293,7 +294,7 @@ def _factors(option, text):
 
 def card_lines(found, bears):
     """The properties of a design, in words."""
-    from flexarm_control.robust.design import what_limits
+    from flexarm_control.robust.words import what_limits
 
     name, pole, *_ = found.worst
     hertz = found.omega_1 / (2.0 * np.pi)

@@ -6,7 +6,7 @@ from matplotlib.ticker import NullLocator
 
 from flexarm_control.robust.card import FARTHEST, poles
 from flexarm_control.robust.decay import Wanted
-from flexarm_control.robust.design import NOISIEST
+from flexarm_control.robust.settings import NOISIEST
 from flexarm_control.robust.uncertain import own_damping
 
 from ..plotting import COMPOSITE, DESIGNED, REFERENCE, SLOW, STYLE, plt, save

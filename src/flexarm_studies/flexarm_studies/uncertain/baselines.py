@@ -41,7 +41,7 @@ from scipy.signal import lfilter
 
 from flexarm_control.motions import shapers
 from flexarm_control.observers.kalman import measurement_covariance
-from flexarm_control.robust.design import NOISIEST
+from flexarm_control.robust.settings import NOISIEST
 from flexarm_control.trajectory import specs
 from flexarm_dynamics.arm.description import scaled
 from flexarm_dynamics.arm.strain_map import StrainMap, gauge_rows

@@ -10,7 +10,7 @@ has ``feedforward: model``. The baselines are tuned for each arm.
 from functools import partial
 
 from flexarm_control.robust.default import default
-from flexarm_control.robust.design import Settings
+from flexarm_control.robust.settings import Settings
 from flexarm_control.robust.uncertain import Uncertainty
 
 from ..comparison.controllers import Setup
