@@ -47,8 +47,9 @@ class Unserved(CallbackGroup):
         """Nothing to do."""
 
 
-#: Max. duration of `taken` [s]; otherwise it would not end if messages arrive as fast as they are read.
-MAX_TAKE = 0.1
+#: Max. duration of `taken` [s]. If messages arrive as fast as they are read, it would otherwise not end, and a session
+#: with several taps would hardly serve its callbacks: the answer of a service then took seconds.
+MAX_TAKE = 0.005
 
 
 def taken(subscription, raw=False):

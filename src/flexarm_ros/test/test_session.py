@@ -2,9 +2,12 @@
 """The session beside nodes: what it collects and calls, and that no wait outlives a process it needs."""
 
 import contextlib
+import itertools
 import os
 import time
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.serialization import deserialize_message
@@ -81,6 +84,16 @@ def test_messages_that_arrive_as_fast_as_they_are_read_do_not_hold_the_session(m
     monkeypatch.setattr(session_of, "MAX_TAKE", 0.01)
     flood = Flood()
     assert len(list(session_of.taken(flood))) == flood.count > 0
+
+
+def test_callbacks_are_served_while_messages_flood_every_tap(session, monkeypatch):
+    clock, served = itertools.count(), []
+    monkeypatch.setattr(session_of, "time", SimpleNamespace(monotonic=lambda: 1e-4 * next(clock)))
+    monkeypatch.setattr(session.executor, "spin_once", lambda **_: served.append(next(clock)))
+    floods = [SimpleNamespace(poll=lambda: list(session_of.taken(Flood()))) for _ in range(5)]
+    monkeypatch.setattr(session, "_taps", dict(enumerate(floods)))
+    session.serve(1.0)
+    assert np.diff(served).max() < 0.03 / 1e-4
 
 
 def test_taps_collect_in_order_and_latest_keeps_the_newest(session):
