@@ -142,6 +142,9 @@ class Latest:
 class Question:
     """A service request that is sent again until an answer arrives.
 
+    A service that is slow serves each request that was sent, for instance resets twice. So the answer is that of the
+    last one; it is awaited until the next request would be due, and an earlier answer is taken if it does not come.
+
     Parameters
     ----------
     client : rclpy.client.Client
@@ -164,16 +167,19 @@ class Question:
 
     def poll(self):
         """Send the request if it is due; return whether the answer has arrived."""
-        if self.answer is None:
-            self.answer = next((f.result() for f in self._futures if f.done()), None)
-            if self.answer is not None:
-                for future in self._futures:
-                    self._client.remove_pending_request(future)
-                if self._then is not None:
-                    self._then(self.answer)
-            elif time.monotonic() > self._again and self._client.service_is_ready():
-                self._again = time.monotonic() + self._every
-                self._futures.append(self._client.call_async(self._request))
+        if self.answer is not None:
+            return True
+        due = time.monotonic() > self._again
+        done = [future for future in self._futures if future.done()]
+        if done and (due or done[-1] is self._futures[-1]):
+            self.answer = done[-1].result()
+            for future in self._futures:
+                self._client.remove_pending_request(future)
+            if self._then is not None:
+                self._then(self.answer)
+        elif not done and due and self._client.service_is_ready():
+            self._again = time.monotonic() + self._every
+            self._futures.append(self._client.call_async(self._request))
         return self.answer is not None
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.serialization import deserialize_message
+from rclpy.task import Future
 from std_msgs.msg import String
 
 from flexarm_dynamics.errors import FlexarmError
@@ -135,3 +136,36 @@ def test_a_service_that_is_not_there_is_named(session):
     session.patience = 0.05
     with pytest.raises(WaitError, match="an answer of the service nothing"):
         session.call(GetParameters, "nothing")
+
+
+@pytest.mark.parametrize(
+    ("answered", "answer"),
+    [
+        ([(0.5, 0)], 0),
+        ([(3.5, 0), (4.0, 1)], 1),  # the service was slow: it serves both requests
+        ([(4.0, 1)], 1),  # the first answer was lost
+        ([(3.5, 0)], 0),  # the service ended after the first
+    ],
+)
+def test_the_answer_of_a_service_is_that_of_the_last_request(monkeypatch, answered, answer):
+    now, futures, told = [0.1], [], []
+    monkeypatch.setattr(session_of, "time", SimpleNamespace(monotonic=lambda: now[0]))
+
+    def send(request):
+        futures.append(Future())
+        return futures[-1]
+
+    client = SimpleNamespace(
+        service_is_ready=lambda: True, call_async=send, remove_pending_request=futures.remove
+    )
+    question = session_of.Question(client, None, told.append, again=3.0)
+    sent = []
+    for now[0] in np.arange(0.1, 20.0, 0.1).tolist():
+        if question.poll():
+            break
+        sent = list(futures)
+        for at, k in answered:
+            if now[0] > at and not futures[k].done():
+                futures[k].set_result(k)
+    assert question.answer == answer and told == [answer]
+    assert not futures and len(sent) == 1 + (answered[-1][0] > 3.0)
