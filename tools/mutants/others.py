@@ -7,6 +7,23 @@ RANDOM_ARMS = "flexarm_studies/test/test_random_arms.py"
 
 ERRORS = [
     *of(
+        "flexarm_ros",
+        ".",
+        "flexarm_ros/test/test_session.py",
+        (
+            "session",
+            "a request that was sent twice: the first answer is taken",
+            "if done and (due or done[-1] is self._futures[-1]):",
+            "if done:",
+        ),
+        (
+            "session",
+            "a flood of messages keeps a session from its callbacks",
+            "MAX_TAKE = 0.005",
+            "MAX_TAKE = 0.1",
+        ),
+    ),
+    *of(
         "flexarm_sim",
         ".",
         "flexarm_sim/test/test_damping.py",
