@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 
 from flexarm_control.motions import profiles
-from flexarm_control.nodes.controller_report import SWINGS, Report
+from flexarm_control.nodes.controller_report import HUNTS, SWINGS, Report
 from flexarm_control.robust import cache, default
 from flexarm_dynamics.arm import arm_file
 from flexarm_ros.node import WARN
@@ -155,11 +155,14 @@ def test_the_delay_of_the_loop_is_measured_and_compared_with_what_the_design_bea
         message = lockstep.trajectory_message(names, profile, 51, TRAJECTORY_START_NS)
         nodes.record(message, 0.2)
         level, text, values = nodes.nodes["controller"].diagnose()
-        swings = nodes.nodes["controller"].design._replace(comes_back=False)
-        parts = nodes.nodes["controller"], nodes.nodes["controller"].core, swings
-        warned = Report(*parts).diagnose()
+        parts = nodes.nodes["controller"], nodes.nodes["controller"].core
+        found = nodes.nodes["controller"].design
+        warned = [
+            Report(*parts, found._replace(**marks)).diagnose()[:2]
+            for marks in ({"comes_back": False}, {"hunts": True})
+        ]
         del parts
-    assert warned[:2] == (WARN, SWINGS)
+    assert warned == [(WARN, SWINGS), (WARN, HUNTS)]
     assert values["speed of the design"] == "1"
     assert float(values["torque delay p50 [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)
     assert float(values["torque delay max [ms]"]) == pytest.approx(2.0 * periods, abs=1e-3)
@@ -253,21 +256,23 @@ def test_a_node_that_designs_serves_and_ends(bench, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("speed", "slowed", "comes_back", "shown"),
+    ("speed", "slowed", "comes_back", "hunts", "shown"),
     [
-        (0.7, False, True, "0.7"),
-        (0.35, True, True, "0.35, lowered because of the torque limits"),
+        (0.7, False, True, False, "0.7"),
+        (0.7, False, True, True, f"0.7; {HUNTS}"),
+        (0.35, True, True, False, "0.35, lowered because of the torque limits"),
         (
             0.35,
             True,
+            False,
             False,
             "0.35, lowered because of the torque limits; at the torque limits the arm may swing: give motions more"
             " time",
         ),
     ],
 )
-def test_a_design_that_torque_limits_slow_is_shown_as_such(speed, slowed, comes_back, shown):
-    found = default.Default({}, 0.003, 0.01, 0.4, speed, slowed, comes_back)
+def test_what_is_wrong_with_a_design_is_shown(speed, slowed, comes_back, hunts, shown):
+    found = default.Default({}, 0.003, 0.01, 0.4, speed, slowed, comes_back, hunts)
     with InProcess() as nodes:
         nodes.start("controller", {"arm": "R"})
         plain = nodes.nodes["controller"].diagnose()[2]

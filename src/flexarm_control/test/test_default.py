@@ -76,7 +76,7 @@ def test_a_design_is_made_once_and_is_what_flexarm_design_makes(made):
     first = default.default(ARM, *TASK)
     assert first.parameters == design(ARM, *TASK).parameters()
     assert first.delay == 0.003 and first.bears_delay > first.delay
-    assert first.speed == 1.0 and not first.slowed and first.comes_back
+    assert first.speed == 1.0 and not first.slowed and first.comes_back and not first.hunts
     assert default.default(ARM, *TASK) == first and len(made) == 1
 
 

@@ -291,7 +291,7 @@ def test_designs_of_a_file_are_run_and_missing_ones_made_and_added(tmp_path, mon
         made.append(case.name)
         if case.name.endswith("_1"):
             raise DesignError("has no stable gains", field="controller of it")
-        return Default({"slow.stiffness": [7.0]}, 0.002, 0.01, 0.4, 1.0, False, True)
+        return Default({"slow.stiffness": [7.0]}, 0.002, 0.01, 0.4, 1.0, False, True, False)
 
     def run(case, setup, variant, seed):
         ran.append((case.name, setup.controller["feedforward"], setup.controller["slow.stiffness"]))

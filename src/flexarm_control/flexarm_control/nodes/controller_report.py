@@ -12,6 +12,8 @@ from ..loop.supervisor import State
 OTHER_RATE = 0.2
 #: Warning about a design with which the arm does not come back from its torque limits.
 SWINGS = "at the torque limits the arm may swing: give motions more time"
+#: Warning about a design with which a vibration grows while some joints stick and others slide.
+HUNTS = "because of friction the arm may hunt: start with a lower design.speed, or a larger design.effort"
 
 
 class Report:
@@ -103,6 +105,8 @@ class Report:
             speed += ", lowered because of the torque limits"
         if not design.comes_back:
             speed += f"; {SWINGS}"
+        if design.hunts:
+            speed += f"; {HUNTS}"
         return {
             "designed for a delay of [ms]": _milliseconds(design.delay),
             "bears a delay of [ms]": _milliseconds(design.bears_delay),
@@ -156,6 +160,8 @@ class Report:
             return WARN, "the fast control is off: call ~/enable_fast with data true"
         if self._design is not None and not self._design.comes_back:
             return WARN, SWINGS
+        if self._design is not None and self._design.hunts:
+            return WARN, HUNTS
         return OK, ""
 
 

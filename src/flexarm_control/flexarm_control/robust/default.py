@@ -89,6 +89,7 @@ class Default(NamedTuple):
     speed: float  # of the design [-]
     slowed: bool  # `Design.slowed`
     comes_back: bool  # `Design.comes_back`
+    hunts: bool  # `Design.hunts`
 
 
 def is_wanted(name, given, kind=AUTO):
@@ -157,6 +158,7 @@ def find(arm, settings, uncertainty):
         "speed": float(found.settings.speed),
         "slowed": bool(found.slowed),
         "comes_back": bool(found.comes_back),
+        "hunts": bool(found.hunts),
     }
 
 
