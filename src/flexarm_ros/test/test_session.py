@@ -148,7 +148,7 @@ def test_a_service_that_is_not_there_is_named(session):
     ],
 )
 def test_the_answer_of_a_service_is_that_of_the_last_request(monkeypatch, answered, answer):
-    now, futures, told = [0.1], [], []
+    now, futures, given = [0.1], [], []
     monkeypatch.setattr(session_of, "time", SimpleNamespace(monotonic=lambda: now[0]))
 
     def send(request):
@@ -158,7 +158,7 @@ def test_the_answer_of_a_service_is_that_of_the_last_request(monkeypatch, answer
     client = SimpleNamespace(
         service_is_ready=lambda: True, call_async=send, remove_pending_request=futures.remove
     )
-    question = session_of.Question(client, None, told.append, again=3.0)
+    question = session_of.Question(client, None, given.append, again=3.0)
     sent = []
     for now[0] in np.arange(0.1, 20.0, 0.1).tolist():
         if question.poll():
@@ -167,5 +167,5 @@ def test_the_answer_of_a_service_is_that_of_the_last_request(monkeypatch, answer
         for at, k in answered:
             if now[0] > at and not futures[k].done():
                 futures[k].set_result(k)
-    assert question.answer == answer and told == [answer]
+    assert question.answer == answer and given == [answer]
     assert not futures and len(sent) == 1 + (answered[-1][0] > 3.0)
