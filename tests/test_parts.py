@@ -100,8 +100,8 @@ def test_ci_runs_each_part_by_its_number():
     lines = [line for line in text.splitlines() if line.startswith("part")]
     script = "git() { echo $count; }; " + "; ".join(lines) + '; echo "$part/$parts"'
     found = set()
-    for count in range(100, 112):
+    for count in range(100, 124):
         run = ["bash", "-c", f"count={count}; {script}"]
         found.add(subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip())
-    assert found == {f"{part}/6" for part in range(1, 7)}
+    assert found == {f"{part}/12" for part in range(1, 13)}
     assert 'LONG="$part/$parts"' in text
