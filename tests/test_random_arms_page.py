@@ -2,12 +2,20 @@
 """docs/random_arms.md: its tables are those of the rows beside it, and the designs beside it give these rows."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from flexarm_studies.random_arms import report, study
+from flexarm_control.robust.settings import Settings
+from flexarm_control.robust.task import Task
+from flexarm_control.robust.uncertain import Uncertainty
+from flexarm_studies.random_arms import generator, report, study
+from flexarm_studies.uncertain.baselines import task_of
+from flexarm_studies.uncertain.controllers import DELAY, RATE
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
@@ -34,6 +42,24 @@ def test_every_designed_row_has_its_design():
     assert len(designed) == 600
     for row in designed:
         assert_allclose(row["decay"], reached[row["number"]], rtol=1e-5, err_msg=row["sample"])
+
+
+# Those with the fastest growth, and those to which the rule applies. It takes part in the design, so a change of it may
+# leave a published design behind.
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [5, 58, 38, pytest.param(55, marks=pytest.mark.long)])
+def test_a_published_design_is_marked_if_its_arm_may_hunt(number):
+    (design,) = [d for d in lines("random_arms_designs.jsonl")[1] if d["number"] == number]
+    case, given = generator.arm(number, 0), design["parameters"]
+    start, middle, end = (tuple(q.tolist()) for q in task_of(case).places)
+    settings = Settings(rate=RATE, delay=DELAY, configurations=(middle, start, end))
+    task = Task(case.read(), settings, Uncertainty())
+    n, m = len(task.arm.joints), task.nominal.n_modes
+    pid = [np.reshape(given[f"slow.{k}"], (-1, n)) for k in ("stiffness", "damping", "integral")]
+    joints = np.concatenate([part[:, None, :] * np.eye(n) for part in pid], axis=2)
+    K = np.concatenate([joints, -np.reshape(given["fast.gain"], (-1, n, 2 * m))], axis=2)
+    sampling = replace(task.sampling, torque_corner=given["slow.bandwidth"] or np.inf)
+    assert task.hunts_apart(SimpleNamespace(K=K, sampling=sampling, decay=1.0)) == design["hunts"]
 
 
 # One arm of each number of links; arms 26 and 85 were once lost with a heavier payload, arms 18 and 55 hunted while one

@@ -103,15 +103,19 @@ class Report:
         speed = f"{design.speed:g}"
         if design.slowed:
             speed += ", lowered because of the torque limits"
-        if not design.comes_back:
-            speed += f"; {SWINGS}"
-        if design.hunts:
-            speed += f"; {HUNTS}"
+        speed = "; ".join([speed, *self._design_warnings()])
         return {
             "designed for a delay of [ms]": _milliseconds(design.delay),
             "bears a delay of [ms]": _milliseconds(design.bears_delay),
             "speed of the design": speed,
         }
+
+    def _design_warnings(self):
+        """What the design itself does not hold."""
+        design = self._design
+        if design is None:
+            return []
+        return [SWINGS] * (not design.comes_back) + [HUNTS] * design.hunts
 
     def _of_payload(self):
         found = self._core.payload
@@ -158,10 +162,8 @@ class Report:
             return WARN, core.reason
         if not core.fast_enabled:
             return WARN, "the fast control is off: call ~/enable_fast with data true"
-        if self._design is not None and not self._design.comes_back:
-            return WARN, SWINGS
-        if self._design is not None and self._design.hunts:
-            return WARN, HUNTS
+        if warnings := self._design_warnings():
+            return WARN, "; ".join(warnings)
         return OK, ""
 
 

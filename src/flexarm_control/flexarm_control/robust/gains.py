@@ -70,8 +70,8 @@ class Design:
         Whether the speed is lower than requested, because the arm would not come back from its torque limits with
         faster gains.
     hunts : bool
-        Whether a vibration grows fast while some joints stick and others slide (`GROWS_FAST`), and no gains were found
-        with which it does not.
+        Whether a vibration grows fast while some joints stick and others slide (`task.GROWS_FAST`), and no gains were
+        found with which it does not.
     """
 
     arm: object
